@@ -1,4 +1,4 @@
-"""What bodies that part hand on to their parts: faults, gains, plans, and the accounts of their magnets."""
+"""What a body hands on to its parts when it splits: faults, gains, plans, and the accounts of its magnets."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from tests.unit.tanks import RING, Docked
 
 @pytest.mark.slow
 def test_parts_of_a_broken_body_are_as_broken_as_it_was() -> None:
-    """A thruster is out, a cabin loses its pressure, the ground station has fallen silent; then the joint opens."""
+    """A thruster is dead, a cabin's pressure has risen and the ground station is silent when the joint opens."""
     tank = Docked(RING[:2])
     tank.run(0.5)
     tank.run(1.0, Request(Action.GROUND_ALIVE), Request(Action.ARM))
@@ -70,7 +70,7 @@ def test_parted_modules_magnets_keep_their_accounts() -> None:
 
 
 def test_joint_that_holds_for_a_moment_and_is_lost_again_is_parted_by_another_plan() -> None:
-    """The first plan comes while nothing is open, and is dropped."""
+    """The first plan arrives while no joint is open, and is dropped."""
     tank = Docked(RING[:2], delay=60)
     tank.fly()
     tank.lose(1)

@@ -1,4 +1,4 @@
-"""A docked partner that is lost or let go in flight: what is believed, who is told, and that every module is flown by just one body."""
+"""Docked partners lost or undocked in flight: what the firmware believes, which body is told, and that one body alone flies each module."""
 
 from dataclasses import replace
 
@@ -66,7 +66,7 @@ def test_current_alone_is_reported_and_parts_nothing_that_pictures_show_in_its_p
 
 
 def test_partner_that_may_be_lost_is_undocked_when_somebody_asks_for_that() -> None:
-    """Its magnets carry no current, pictures show it in its place: nobody else will part them."""
+    """Its magnets carry no current but pictures show it in place, so the fail-safe does not part them: only a request does."""
     tank = Docked(RING[:2])
     tank.fly()
     tank.weak.add(1)
@@ -78,7 +78,7 @@ def test_partner_that_may_be_lost_is_undocked_when_somebody_asks_for_that() -> N
 
 
 def test_joint_that_holds_is_not_undocked_while_a_partner_is_lost() -> None:
-    """Module 0 may be lost: 1 and 2 hold together. Nor does a word for what is no joint end what the fail-safe does."""
+    """Module 0 may be lost, but 1 and 2 hold together. A request for a missing joint does not end the fail-safe's mode."""
     tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0)], Parameters().replace("failsafes.partner_lost_action", int(Level.SURFACE)))
     tank.fly()
     tank.weak.add(0)
@@ -92,7 +92,7 @@ def test_joint_that_holds_is_not_undocked_while_a_partner_is_lost() -> None:
 
 
 def test_neighbours_that_turn_two_probes_to_each_other_are_no_joint_that_could_be_lost() -> None:
-    """Random shapes have such neighbours: a joint that was believed there kept the robot from arming."""
+    """Random shapes have such neighbours; taking them for a joint once kept the robot from arming."""
     ring = Docked(RING).pipeline.bodies[0]
     assert len(joints_of(ring)) == 4
     assert len(joints_of(replace(ring, faces=(*ring.faces[:3], "PPPPPP")))) == 2
@@ -151,7 +151,7 @@ def test_disarmed_body_whose_joint_pictures_show_closed_is_not_undocked() -> Non
 
 @pytest.mark.parametrize(("module", "target"), [(1, 3), (3, 1)])
 def test_disarmed_ring_is_parted_where_it_has_come_apart_whichever_side_is_named(module: int, target: int) -> None:
-    """Module 1 has come off both its neighbours: 3 was to leave by the joint that still holds it too, and was refused."""
+    """Module 1 has come off both its neighbours. The undock once included the joint by which 2 still holds 3, and was refused."""
     tank = Docked(RING)
     tank.run(0.5)
     tank.lose(1)
@@ -163,7 +163,7 @@ def test_disarmed_ring_is_parted_where_it_has_come_apart_whichever_side_is_named
 
 @pytest.mark.parametrize("asked", [DockRequest(1, 1, 0, 0), DockRequest(2, 0, 3, 1)], ids=str)
 def test_disarmed_ring_that_has_come_apart_into_halves_is_undocked_into_them(asked: DockRequest) -> None:
-    """Each corner was to leave alone, by both its joints, of which one holds: only forced arming parted the halves."""
+    """An undock once parted a single corner by both its joints, of which one holds here, so only forced arming parted the halves."""
     tank = Docked(RING)
     tank.run(0.5)
     hear = tank._hear
@@ -229,7 +229,7 @@ def test_ring_with_one_open_joint_is_still_one_body_and_asks_once() -> None:
 
 @pytest.mark.parametrize("again", [DockRequest(1, 1, 0, 0), DockRequest(0, 0, 1, 1)], ids=["alike", "from the other side"])
 def test_undock_that_is_asked_for_twice_parts_once(again: DockRequest) -> None:
-    """A client whose answer was lost asks again: it was told that its undock began anew, and after it was done that it had ended."""
+    """A client that missed the answer asks again. It was once told that its undock had restarted and, once done, that it had ended."""
     tank = Docked(RING[:2])
     tank.fly()
     for request in (DockRequest(1, 1, 0, 0), again):
@@ -284,7 +284,7 @@ def test_slow_camera_too_tells_a_module_that_leaves_from_one_that_a_hanging_rela
         modules, since_s = hear(tick), 0.01 * (tick - TAG_DELAY_TICKS - first)
         for m, module in enumerate(modules):
             for tag in module.tags if m == 1 and not stuck else []:
-                tag.p_wt[0] += 0.0 if since_s < 0.0 else 0.1 * since_s  # as the bench's magnets push
+                tag.p_wt[0] += 0.0 if since_s < 0.0 else 0.1 * since_s  # as fast as the bench's magnets push
             if (tick - TAG_DELAY_TICKS) % every:
                 module.tags.clear()
         return modules
@@ -297,7 +297,7 @@ def test_slow_camera_too_tells_a_module_that_leaves_from_one_that_a_hanging_rela
 
 @pytest.mark.slow
 def test_partner_that_is_being_undocked_is_not_lost() -> None:
-    """While the magnets push, currents and pictures say that the joint is open: it is wanted so."""
+    """While the magnets push, currents and pictures show an open joint, as intended."""
     tank = Docked(RING[:2], Parameters().replace("docking.release_s", 2.0))
     tank.fly()
     tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
@@ -342,7 +342,7 @@ def test_three_that_have_all_come_apart_are_three_however_they_are_numbered(cell
 
 @pytest.mark.parametrize("hidden", [set(), {1}], ids=["seen", "out of sight"])
 def test_magnets_that_the_limiter_rests_are_no_lost_partner(hidden: set[int]) -> None:
-    """Their currents are gone, and with a partner out of sight nothing else would speak for the joint."""
+    """Resting magnets carry no current, and if the partner is out of sight, no picture shows the joint closed either."""
     tank = Docked(RING[:2], Parameters().replace("limiter.relay_on_s", 2.0))
     hear, relays = tank._hear, [(1,) * 6] * 2
 

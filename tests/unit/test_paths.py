@@ -1,4 +1,4 @@
-"""Trajectories: the figures of the issues, derivatives against differences, rest at both ends, and waypoint files."""
+"""Trajectories: the figures of the issues, derivatives against finite differences, rest at both ends, and waypoint files."""
 
 import math
 from collections.abc import Callable
@@ -48,7 +48,7 @@ def test_robot_starts_and_ends_at_rest_without_a_jerk(trajectory: Trajectory) ->
         for value in trajectory.sample(t)[2:]:
             np.testing.assert_allclose(value, 0.0, atol=1e-12)
     for near, far in ((h, 2 * h), (end - h, end - 2 * h)):
-        # Without a jerk at the ends acceleration grows with the square of time there.
+        # With zero jerk at the ends, acceleration grows with the square of time there.
         a, b = (float(np.linalg.norm(trajectory.sample(t).a_w)) for t in (near, far))
         assert b / a == pytest.approx(4.0, rel=0.01)
 

@@ -1,4 +1,4 @@
-"""The whole tick in a small world: arm, hold and follow; whole fleets; and mistakes that have to show."""
+"""Whole ticks in a small simulated world: arm, hold and follow; fleets; and modelling mistakes that must show in the flight."""
 
 from dataclasses import replace
 
@@ -32,7 +32,7 @@ def test_disarmed_robot_turns_nothing(tank: Tank) -> None:
 
 
 def test_disarmed_robot_is_wanted_where_it_is(tank: Tank) -> None:
-    """So that nothing jumps when it arms."""
+    """Nothing must jump when it arms."""
     record = tank.run(1.0).records[0]
     np.testing.assert_array_equal(record.setpoint.p_wb, record.estimate.p_wb)
     np.testing.assert_array_equal(record.setpoint.q_wb, record.estimate.q_wb)
@@ -109,7 +109,7 @@ def test_estimate_is_the_truth_where_the_world_is_the_model(tank: Tank) -> None:
 
 
 def test_force_that_the_limiter_took_is_not_believed_in() -> None:
-    """A tenth of the thrust, asked for all of it: what is missing must not pass for a current."""
+    """With thrusters limited to a tenth of their force, the missing force must not be estimated as a current."""
     tank = Tank([single()], Parameters().replace("limiter.force_share", 0.1))
     tank.run(0.5)
     tank.run(0.3, Request(Action.ARM))
@@ -153,7 +153,7 @@ def test_sagging_battery_raises_the_commands(tank: Tank) -> None:
 
 
 def test_battery_reading_of_nothing_changes_no_command(tank: Tank) -> None:
-    """Neither at once nor by way of the mean."""
+    """Neither at once nor through the smoothed voltage."""
     tank.run(0.5)
     tank.run(1.0, Request(Action.ARM))
     before = tank.pipeline.formation.chains[0].supply.voltage_v.copy()
@@ -193,7 +193,7 @@ def test_what_is_said_names_the_body_that_it_is_about() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("modules", [[0, 1, 2], [2, 0, 1]])
 def test_docked_shape_holds_its_place_however_its_modules_sit_and_count(modules: list[int]) -> None:
-    """An L of three whose modules all sit differently: a mix-up of frames, levers or commands would throw it about."""
+    """The three modules of the L are rotated differently: mixed-up frames, levers or commands would throw it off its place."""
     shape = assemble([(0, 0, 0), (1, 0, 0), (1, 1, 0)], [0, 4, 12], [load_vehicle("modcube")] * 3, modules)
     tank = Tank([shape])
     tank.run(0.5)
@@ -209,7 +209,7 @@ def test_docked_shape_holds_its_place_however_its_modules_sit_and_count(modules:
 
 
 def spoilt(body: Body, mistake: str) -> Body:
-    """What a wrong vehicle file or a sign error in prepare would make of a body."""
+    """The body that a wrong vehicle file or a sign error in prepare would produce."""
     t = body.thrusters
     if mistake == "tag lever 3 cm off":
         return replace(body, r_bt=body.r_bt + np.array([0.0, 0.03, 0.0]))

@@ -1,4 +1,4 @@
-"""The whole tick of robots that are stopped, or whose thrusters are tested: what turns, and what does not."""
+"""Whole ticks of robots that are stopped, or whose thrusters are tested: which thrusters turn and which do not."""
 
 import numpy as np
 import pytest
@@ -80,9 +80,9 @@ def test_motor_detection_turns_one_thruster_after_the_other_with_pauses_between(
     assert (commanded[begins, np.arange(8)] > 0.0).all(), "forward first"
     np.testing.assert_allclose((commanded < 0.0).sum(axis=0) * DT, 0.5 * p.test_s, atol=2 * DT)
     force = np.array([outputs.records[0].thrust.force_n for outputs in tank.outputs[first:]])
-    rate = np.cumsum(force, axis=0) * DT  # of a mass of one
+    rate = np.cumsum(force, axis=0) * DT  # speed of a unit mass
     np.testing.assert_allclose(rate[-1], 0.0, atol=2.0 * DT * np.abs(force).max())
-    np.testing.assert_allclose(rate.sum(axis=0) * DT, 0.0, atol=4.0 * DT * p.test_s * np.abs(force).max())  # it is back
+    np.testing.assert_allclose(rate.sum(axis=0) * DT, 0.0, atol=4.0 * DT * p.test_s * np.abs(force).max())  # it is back at its start
 
 
 @pytest.mark.parametrize("share", [0.1, -0.1, 1.0, -1.0])
@@ -96,7 +96,7 @@ def test_tested_thruster_gives_the_wanted_share_of_its_side_and_never_more_than_
 
 
 def test_robot_that_lost_an_axis_trusts_its_thrusters_again_once_it_is_disarmed(tank: Tank) -> None:
-    """What no longer turns is found again within half a second of flying."""
+    """A thruster that no longer turns is found again within half a second of flight."""
     tank.run(0.5)
     tank.run(0.5, Request(Action.ARM))
     chain = tank.pipeline.formation.chains[0]
@@ -110,7 +110,7 @@ def test_robot_that_lost_an_axis_trusts_its_thrusters_again_once_it_is_disarmed(
 
 
 def test_e_stop_that_only_the_module_of_one_body_has_heard_stops_every_body() -> None:
-    """It was pressed on one of two buses, while the firmware did not hear that one."""
+    """It was pressed on one of two buses while the firmware did not hear that bus."""
     tank = Tank([single(0), single(1)])
     hear, says = tank._hear, [2]
 

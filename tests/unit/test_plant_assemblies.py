@@ -28,7 +28,7 @@ UNEVEN = dataclasses.replace(
         VEHICLE.inertial, added=np.array([3.0, 9.0, 6.0, 0.01, 0.03, 0.02]), com_m=np.array([0.01, -0.02, 0.015]), righting_arm_m=0.0
     ),
 )
-"""Of uneven added mass, its weight off the middle; nothing rights it."""
+"""A module with uneven added mass, an off-centre centre of mass and no righting moment."""
 SHAPES = {
     "line": [[0, 0, 0], [1, 0, 0]],
     "L": [[0, 0, 0], [1, 0, 0], [1, 1, 0]],
@@ -151,7 +151,7 @@ def test_body_whose_cells_do_not_touch_is_refused() -> None:
 
 
 def docked(cells: list[list[int]], vehicle: Vehicle, turns: tuple[int, ...] = (), step_ns: int = STEP_NS, **world: float) -> World:
-    """Modules that start docked, tilted, in calm deep water; the first one in the origin of its body."""
+    """Modules that start docked and tilted in calm deep water, the first one at the origin of the body."""
     places = [place(np.array(c), r, 0.21, np.array(cells[0])) for c, r in zip(cells, turns or (0,) * len(cells), strict=True)]
     starts = [Start(np.array([0.0, 0.0, 400.0]), rotations.from_euler(0.4, -0.7, 1.9))] * len(cells)
     spec, period_ns = WorldSpec(**{**CALM, **world}), max(step_ns, PERIOD_NS // 1000)
@@ -159,7 +159,7 @@ def docked(cells: list[list[int]], vehicle: Vehicle, turns: tuple[int, ...] = ()
 
 
 def test_current_only_moves_the_frame_of_docked_modules() -> None:
-    """Towed in still water and held in a steady current are the same relative to the water (Galilei), whatever the shape."""
+    """A body of any shape moves relative to a steady current as it does relative to still water (Galilean invariance)."""
     moving, still = (docked(SHAPES["L"], UNEVEN, (0, 4, 12), current_m_s=speed) for speed in (0.3, 0.0))
     current = moving.truth(0).current_w
     assert np.linalg.norm(current) == pytest.approx(0.3)
@@ -174,7 +174,7 @@ def test_current_only_moves_the_frame_of_docked_modules() -> None:
 
 
 def test_neutral_docked_modules_are_carried_along_by_accelerating_water_and_not_turned() -> None:
-    """Without drag a body that weighs what it displaces, where it displaces it, follows the water (Froude-Krylov and added mass)."""
+    """Without drag, a neutral body whose weight and buoyancy act at the same point follows the water (Froude-Krylov and added mass)."""
     smooth = dataclasses.replace(UNEVEN, drag=dataclasses.replace(UNEVEN.drag, cd_face=0.0, cd_edge=0.0, rotational_cd=0.0))
     world = docked(SHAPES["L"], smooth, (0, 4, 12), gust_m_s=0.3, gust_time_s=2.0, gust_smoothing_s=0.5)
     world.set_motion(0, world.truth(0).current_w, np.zeros(3))
@@ -188,7 +188,7 @@ def test_neutral_docked_modules_are_carried_along_by_accelerating_water_and_not_
 
 
 def test_accelerometer_of_every_docked_module_feels_what_its_own_motion_says() -> None:
-    """Specific forces against differences of the hulls' velocities, while a body tumbles and a hand turns it."""
+    """Compares specific forces with differences of the hulls' velocities while a body tumbles and an external push turns it."""
     world = docked(SHAPES["L"], UNEVEN, (0, 4, 12), step_ns=10_000)
     world.push[2] = [1.5, 1.0, -2.0, 0.25, 0.15, -0.3]
     world.set_motion(0, np.array([0.2, -0.1, 0.3]), np.array([0.3, -0.6, 0.5]))
@@ -206,7 +206,7 @@ def test_accelerometer_of_every_docked_module_feels_what_its_own_motion_says() -
 
 
 def drag_on(world: World, v_b: np.ndarray, w_b: np.ndarray) -> np.ndarray:
-    """(6,) force and moment of still water about the origin of a neutral body that moves so, body frame."""
+    """(6,) drag force and moment of still water about the origin of a neutral body that moves at `v_b`, `w_b`; body frame."""
     world.set_motion(0, rotations.rotate(world.body_truth(0).q_wb, v_b), w_b)
     moving = world._body_arrays.wrench[0].copy()
     world.set_motion(0, np.zeros(3), np.zeros(3))
@@ -227,10 +227,10 @@ def test_drag_acts_where_the_middle_of_the_outline_is(name: str) -> None:
 
 
 def test_sides_that_a_line_of_two_covers_do_not_brake_its_turning() -> None:
-    """About the first module's middle: strips of its own sides and the other's, and the other's way through the water; by quadrature."""
+    """About the first module's centre, by quadrature: strips of both modules' sides, and the other module's speed through the water."""
     half, reach, cd = 0.105, 0.21, VEHICLE.drag
     open_sides = quad(lambda y: abs(y) * y * y, -half, half)[0]
-    across_x = 0.5 * open_sides  # one of each two is covered
+    across_x = 0.5 * open_sides  # one side of each pair is covered
     near = open_sides + across_x
     far = quad(lambda y: abs(reach + y) * (reach + y) * y, -half, half)[0] + across_x
     turning = 0.5 * WorldSpec().density * cd.rotational_cd * 0.21 * (near + far)

@@ -1,4 +1,4 @@
-"""Motion of the plant's bodies against closed forms of mechanics and against integrals done another way."""
+"""Motion of the plant's bodies against closed forms of mechanics and independently computed integrals."""
 
 import dataclasses
 import math
@@ -77,7 +77,7 @@ def test_symmetric_top_precesses_at_eulers_rate() -> None:
 
 
 def test_lopsided_module_is_turned_about_other_axes_than_the_hands() -> None:
-    """By its products of inertia, which a draw spreads with the moments: their share of these stays."""
+    """Its products of inertia cause that; a draw scales them with the moments, so their ratios stay."""
     inertia = np.array([[0.08, 0.02, -0.015], [0.02, 0.06, 0.01], [-0.015, 0.01, 0.07]])
     world = ocean(frictionless(added=np.zeros(6), inertia=inertia), inertia_spread=0.3)
     drawn = np.diag(np.diag(world.draw(0).inertia) / np.diag(inertia)) ** 0.5
@@ -112,7 +112,7 @@ def test_drifting_module_ends_up_moving_with_the_current() -> None:
 
 
 def test_current_only_moves_the_frame() -> None:
-    """Towed in still water and held in a steady current are the same relative to the water (Galilei)."""
+    """A body moves relative to a steady current as it does relative to still water (Galilean invariance)."""
     body = vehicle(added=UNEVEN, com_m=np.array([0.01, 0.0, 0.005]))
     moving, still = ocean(body, current_m_s=0.3), ocean(body)
     current = moving.truth(0).current_w
@@ -125,7 +125,7 @@ def test_current_only_moves_the_frame() -> None:
 
 
 def test_neutral_module_is_carried_along_by_accelerating_water() -> None:
-    """Without drag a body that weighs what it displaces follows the water exactly (Froude-Krylov and added mass)."""
+    """Without drag, a neutrally buoyant body follows the water exactly (Froude-Krylov and added mass)."""
     world = ocean(frictionless(added=UNEVEN), gust_m_s=0.3, gust_time_s=2.0, gust_smoothing_s=0.5)
     world.set_motion(0, world.truth(0).current_w, np.zeros(3))
     for _ in range(500):
@@ -172,14 +172,14 @@ def test_light_module_floats_at_the_surface() -> None:
         spec, Tank(), [vehicle(righting_arm_m=0.005)], [Start(np.array([0.1, 0.1, 0.4]), LEVEL)], seed, PERIOD_NS
     )
     run(world, 120.0)
-    # it shows so much of its 0.0441 m^2 that half a newton of buoyancy is lost
+    # height of its 0.0441 m^2 above the surface that costs half a newton of buoyancy
     shown = 0.5 / (spec.density * spec.gravity * 0.21**2)
     assert world.truth(0).p_wm[2] == pytest.approx(0.105 - shown, abs=2e-4)
 
 
 @pytest.mark.parametrize("q", [LEVEL, rotations.from_euler(math.pi / 2, 0.0, 0.0), rotations.from_euler(0.0, math.pi / 2, 0.3)])
 def test_long_hull_that_is_lifted_out_loses_the_buoyancy_of_what_shows(q: np.ndarray) -> None:
-    """On whichever side it lies: by the box's own geometry."""
+    """Whichever side it lies on; the expected loss follows from the geometry of the box."""
     body, out_m = load_vehicle("bluerov2_heavy"), 0.02
     faces = np.array([body.hull.size_m[1] * body.hull.size_m[2], body.hull.size_m[2] * body.hull.size_m[0], np.prod(body.hull.size_m[:2])])
     up = np.argmax(np.abs(rotations.to_matrix(q)[2]))
@@ -211,7 +211,7 @@ def test_drag_uses_the_outline_that_the_flow_sees() -> None:
         v = rng.standard_normal(3)
         d = v / np.linalg.norm(v)
         plane = np.linalg.svd(d[None, :])[2][1:]
-        area = ConvexHull(corners @ plane.T).volume  # of a plane figure: its area
+        area = ConvexHull(corners @ plane.T).volume  # the volume of a plane figure is its area
         assert drag.translation(*edges, 1.0, 1.0, *v) == pytest.approx(area * np.linalg.norm(v), rel=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""The tag camera of the plant: when it sees, what it sees, and how wrong."""
+"""The tag camera of the plant: when it sees tags, what it reports, and its errors."""
 
 import dataclasses
 import math
@@ -44,7 +44,7 @@ def look(world: World, eye: Camera) -> list[Sighting]:
 
 
 def pictures(eye: Camera, seconds: float, start: Start | None = None) -> list[Sighting]:
-    """What it sees of one module that is held still: the world's time goes on, the module does not."""
+    """Sightings of one module that is held still while the world's time goes on."""
     world = world_of(start or at(0.0, 0.0, 0.4))
     found = []
     for _ in range(round(seconds * 100)):
@@ -71,7 +71,7 @@ def test_level_module_shows_its_top_tag_face_up() -> None:
 def test_tag_is_read_up_to_65_degrees_of_incidence(tilt_deg: float, seen: bool) -> None:
     q = rotations.from_euler(math.radians(tilt_deg), 0.0, 0.0)
     lever = rotations.rotate(q, np.array([0.0, 0.0, -0.105]))
-    # the tag itself is put right below the camera, so that the tilt is the incidence
+    # the tag itself is right below the camera, so the tilt is the angle of incidence
     world = world_of(Start(np.array([0.0, 0.0, 0.4]) - lever, q))
     assert bool(look(world, camera())) == seen
 
@@ -143,7 +143,7 @@ def test_two_percent_of_the_pictures_are_lost() -> None:
 
 
 def test_flipped_pose_looks_the_same_from_the_camera() -> None:
-    """The second pose of a planar tag: seen from far away its corners stay, and their depths are mirrored."""
+    """The ambiguous second pose of a planar tag: from far away its corners appear in the same places, with mirrored depths."""
     start = at(0.2, 0.1, 0.4, rotations.from_euler(0.4, -0.3, 0.7))
     (true,), (flipped,) = look(world_of(start), camera()), look(world_of(start), camera(tag_flipped=1.0))
     np.testing.assert_allclose(flipped.p_wt, true.p_wt)

@@ -1,4 +1,4 @@
-"""Contact of two free bodies may only dissipate: collisions at any tilt, against the energy of the springs reckoned another way."""
+"""Contact of two free bodies may only dissipate energy: collisions at any tilt, against an independent computation of the spring energy."""
 
 import dataclasses
 
@@ -21,13 +21,13 @@ DEPTH_M = 400.0
 COLLISIONS = 120
 TICKS = 250
 DAMPED, ELASTIC = 1e-9, 1e-4
-"""Share of the energy that the integration may add: where contact dissipates as it does; where nothing is dissipated."""
+"""Share of the energy that the integration may add: in contact with the usual dissipation, and without dissipation."""
 
 
 def pair(
     away_m: np.ndarray, q: np.ndarray, other_q: np.ndarray, vehicle: Vehicle = SMOOTH, step_ns: int = STEP_NS, **springs: float
 ) -> World:
-    """Two modules without drag in calm deep water; `springs`: of `contact.Faces`, in place of the scenario's."""
+    """Two modules without drag in calm deep water; `springs`: fields of `contact.Faces` to replace."""
     first = np.array([0.0, 0.0, DEPTH_M])
     starts = [Start(first, q), Start(first + away_m, other_q)]
     world = World(WorldSpec(**CALM), OCEAN, [vehicle] * 2, starts, 0, PERIOD_NS, step_ns)
@@ -36,7 +36,7 @@ def pair(
 
 
 def thrown(seed: int, **springs: float) -> World:
-    """Two hulls that are about to meet: every third time almost face to face, else at any tilt; off the centres, and turning."""
+    """Two turning hulls about to collide off centre: for every third seed almost face to face, else at any tilt."""
     rng = np.random.default_rng(seed)
     q, other_q = (rotations.normalise(rng.standard_normal(4)) for _ in range(2))
     way = rng.standard_normal(3)
@@ -53,7 +53,7 @@ def thrown(seed: int, **springs: float) -> World:
 
 
 def flown(world: World) -> np.ndarray:
-    """(ticks,) kinetic energy of both, J, from before they meet until they have parted."""
+    """(TICKS + 1,) kinetic energy of both hulls, J: before they meet, and after each tick."""
     energy = [world.kinetic_energy().sum()]
     for _ in range(TICKS):
         world.advance(PERIOD_NS)
@@ -74,7 +74,7 @@ def test_hulls_that_collide_at_any_tilt_gain_no_energy_and_keep_their_momentum()
 
 
 def test_springs_of_hulls_give_back_what_they_took() -> None:
-    """Without damping, and so without friction: none of the energy is lost, and none won."""
+    """Without damping, and therefore without friction, energy is neither lost nor gained."""
     met = 0
     for seed in range(COLLISIONS):
         world = thrown(seed, damping=0.0)
@@ -87,7 +87,7 @@ def test_springs_of_hulls_give_back_what_they_took() -> None:
 
 
 def stored(world: World) -> float:
-    """Energy of the springs, J: pressure per depth, 2 k, times the volume under the smaller depth in either hull, in four dimensions."""
+    """Energy of the springs, J: pressure per depth, 2 k, times the four-dimensional volume under the smaller of both depths."""
     planes = []
     for x in world._body_arrays.state:
         normals = rotations.to_matrix(x[3:7].copy()).T
@@ -130,7 +130,7 @@ def test_force_and_moment_between_hulls_are_the_slope_of_the_energy_stored(seed:
 def test_magnets_and_funnel_of_tilted_faces_only_turn_energy_into_motion_and_back(
     coil: float, guide: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In steps of a quarter of the usual length: the funnel is stiff."""
+    """Takes a quarter of the usual step, because the funnel is stiff."""
     tilt = rotations.exp(np.array([0.0, 0.1, -0.12]))
     springs = {"guide": guide, "guide_damping": 0.0, "turning": 0.0, "turning_damping": 0.0}
     world = pair(np.array([0.25, 0.006, -0.004]), LEVEL, tilt, SLIPPERY, STEP_NS // 4, **springs)
@@ -156,7 +156,7 @@ def test_magnets_and_funnel_of_tilted_faces_only_turn_energy_into_motion_and_bac
 
 
 def test_colliding_cubes_bounce_off_and_gain_no_energy() -> None:
-    world = two(0.05, 0.12)  # beside the funnel: hulls alone
+    world = two(0.05, 0.12)  # beside the funnel: only the hulls touch
     world.set_motion(1, [-0.15, 0.0, 0.0], np.zeros(3))
     energy = world.kinetic_energy().sum()
     for _ in range(150):
@@ -184,7 +184,7 @@ def test_rolled_cubes_do_not_pass_through_each_other(roll_deg: float, y_m: float
 @pytest.mark.parametrize("roll_deg", [0.0, 1e-9, 0.3, 30.0, 45.0])
 @pytest.mark.parametrize("y_m", [0.0, 0.05])
 def test_overlap_of_faces_bears_by_its_area(roll_deg: float, y_m: float) -> None:
-    """To be exact, at every depth by what overlaps of the two squares so far inside their edges; Simpson's rule is exact for that."""
+    """At each depth the bearing area is the overlap of both squares, inset by that depth; Simpson's rule is exact for its integral."""
     deep = 2e-4
     world = hulls(0.21 - deep, y_m, roll_deg)
 

@@ -25,7 +25,7 @@ def test_magnets_draw_two_modules_together_and_lock() -> None:
 @pytest.mark.parametrize("quarter", [0, 1, 2, 3])
 def test_pins_allow_four_rotations(quarter: int) -> None:
     q = rotations.from_euler(np.pi / 2 * quarter + 0.05, 0.0, 0.0)
-    level = dataclasses.replace(VEHICLE, inertial=dataclasses.replace(VEHICLE.inertial, righting_arm_m=0.0))  # it would roll back
+    level = dataclasses.replace(VEHICLE, inertial=dataclasses.replace(VEHICLE.inertial, righting_arm_m=0.0))  # else it rolls back
     world = two(0.015, q=q, vehicle=level)
     relays(world, PULL)
     run(world, 3.0)
@@ -36,7 +36,7 @@ def test_pins_allow_four_rotations(quarter: int) -> None:
 
 
 def test_probe_does_not_lock_with_a_probe() -> None:
-    world = two(0.005, q=rotations.from_euler(0.0, 0.0, np.pi))  # +x looks at +x
+    world = two(0.005, q=rotations.from_euler(0.0, 0.0, np.pi))  # +x faces +x
     world.set_relays(0, [PULL, 0, 0, 0, 0, 0])
     world.set_relays(1, [PULL, 0, 0, 0, 0, 0])
     run(world, 2.0)
@@ -136,7 +136,7 @@ def test_faces_lock_from_no_deeper_than_from_afar(gap_m: float) -> None:
 
 @pytest.mark.parametrize("heavy", [0, 1])
 def test_lighter_of_two_that_lock_is_turned_more(heavy: int) -> None:
-    """Each by the other's share of their mass, and so that they fit: of a twist of 9 mrad a third of the mass takes 6."""
+    """Each is turned by the other's share of the total mass until they fit: of a 9 mrad twist, the one with a third of the mass takes 6."""
     inertial = VEHICLE.inertial
     twice = dataclasses.replace(inertial, dry_kg=2.0 * inertial.dry_kg, entrained_kg=2.0 * inertial.entrained_kg)
     vehicles = [VEHICLE, VEHICLE]

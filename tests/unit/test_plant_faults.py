@@ -1,4 +1,4 @@
-"""Faults of the plant and of its wire: each breaks what it says, from when to when it says, and the rest stays as it was."""
+"""Faults of the plant and of its wire: each breaks what it names, for the time that it names, and nothing else."""
 
 import dataclasses
 import itertools
@@ -88,7 +88,7 @@ SINGLE = (
 
 
 def broken(nodes: Nodes) -> list[object]:
-    """What the plant's faults have made of two modules that are told the same."""
+    """State that the plant's faults can change, after one more tick and with the same commands to every module."""
     fly(nodes, 1)
     world, mcus = nodes.world, nodes.mcus.values()
     for mcu in mcus:
@@ -114,12 +114,12 @@ def test_what_broke_is_whole_again_when_the_fault_is_over(fault: Fault) -> None:
 
 
 PAIRS = [pair for pair in itertools.permutations(SINGLE, 2) if len({fault.kind.split("_")[0] for fault in pair}) == 1]
-"""Faults of the same parts."""
+"""Ordered pairs of faults of the same parts."""
 
 
 @pytest.mark.parametrize(("first", "second"), PAIRS)
 def test_fault_that_begins_or_ends_leaves_another_one_as_it_was(first: Fault, second: Fault) -> None:
-    """Whichever began first and whichever ends first: what is broken is that of those that are on."""
+    """Whichever begins or ends first, the state is that of the faults that are on."""
     alone = [broken(nodes_with(fault, scenario="dock")) for fault in (first, second)]
     both = broken(nodes_with(first, second, scenario="dock"))
     times = (((0.0, 0.08), (0.02, 0.05)), ((0.02, 0.05), (0.0, 0.08)), ((0.0, 0.05), (0.02, 0.08)), ((0.02, 0.08), (0.0, 0.05)))
@@ -142,7 +142,7 @@ def test_two_faults_of_the_same_words_are_two() -> None:
 
 
 def test_magnet_that_hangs_is_not_moved_by_another_fault() -> None:
-    """A relay that goes off and on again would surge."""
+    """A relay that is switched off and on again would cause a current surge."""
     nodes = nodes_with(
         Fault(kind="magnet", index=1, value=1.0), Fault(kind="magnet", index=1, value=0.0, at_s=0.1), Fault(kind="leak", at_s=0.5)
     )
@@ -163,7 +163,7 @@ def test_fault_of_one_module_leaves_the_other_whole() -> None:
 
 
 def test_hand_pushes_with_its_force_for_its_time_from_a_side_of_the_seed_s_own() -> None:
-    """From rest in still water: the hull gains F t over its mass, water included, and a turn; another seed's hand pushes elsewhere."""
+    """From rest in still water, the hull gains a speed of F t over its mass, water included, and a turn; another seed pushes elsewhere."""
     calm = load_scenario("hover").with_calm_world()
     gained = []
     for seed in (0, 1):
@@ -214,7 +214,7 @@ def test_tags_jump_and_vanish() -> None:
 
 
 def sighted(*faults: Fault, scenario: str) -> dict[int, np.ndarray]:
-    """(n, 3) what the tag computer says of each module's place, by its number."""
+    """(n, 3) positions of each module as the tag computer reports them, by module number."""
     frames, receiver = fly(nodes_with(*faults, scenario=scenario), 60, u=0.0), Receiver(CODEC)
     received = [r for frame in frames if (r := receiver.accept(frame)) is not None and r.message.name == "TAG_POSITION"]
     return {number: np.array([r.values[:3] for r in received if r.number == number]) for number in (1, 2)}
@@ -229,7 +229,7 @@ def sighted(*faults: Fault, scenario: str) -> dict[int, np.ndarray]:
     ],
 )  # fmt: skip
 def test_module_that_a_carried_camera_sees_is_off_by_a_fault_once(fault: Fault, off_m: dict[int, float]) -> None:
-    """Module 2 carries the camera that sees module 1, which takes over what is wrong with the carrier's own place."""
+    """Module 2 carries the camera that sees module 1, so an error of module 2's own position shifts module 1 too."""
     bad, good = sighted(fault, scenario="dock-vertical"), sighted(scenario="dock-vertical")
     for number, expected in off_m.items():
         off = bad[number] - good[number]
@@ -299,7 +299,7 @@ def test_two_delays_add_up() -> None:
 
 @pytest.mark.parametrize("kind", ["frame_loss", "frame_delay", "frame_duplicate", "frame_corrupt"])
 def test_frame_fault_of_one_module_is_of_the_frames_with_its_number(kind: str) -> None:
-    """SYNC and everything else that has another number goes through."""
+    """SYNC and all frames with another number pass unchanged."""
     frames = [CODEC.message("SYNC").encode(0, [7]), *FRAMES, Frame(0x01E, b"")]
     out = Wire(0, "to_plant").pass_on(frames, [Fault(kind=kind, value=1.0, module=3)], 0)
     assert [f for f in out if f.id & 31 != 3] == [f for f in frames if f.id & 31 != 3]
@@ -364,7 +364,7 @@ def test_another_controller_switches_the_relays_off() -> None:
 
 
 def test_box_and_second_leader_speak_in_an_order_that_depends_on_nothing() -> None:
-    """The number that is lower wins the bus."""
+    """The lower CAN id wins arbitration."""
     for kinds in (("estop", "foreign_sync"), ("foreign_sync", "estop")):
         nodes = nodes_with(*(Fault(kind=kind) for kind in kinds))
         assert [frame.id for frame in fly(nodes, 1) if frame.id in (0x01E, 0x020)] == [0x01E, 0x020]
@@ -372,7 +372,7 @@ def test_box_and_second_leader_speak_in_an_order_that_depends_on_nothing() -> No
 
 @pytest.mark.parametrize(("value", "relay"), [(1.0, 1), (-1.0, 2), (0.0, 0)])
 def test_magnet_that_hangs_does_not_obey(value: float, relay: int) -> None:
-    """It pulls, pushes or is dead, whatever comes."""
+    """It pulls, pushes or is dead, whatever is commanded."""
     nodes = nodes_with(Fault(kind="magnet", module=1, index=1, value=value))
     fly(nodes, 30)
     currents = nodes.world.docks.current_ma()[0]

@@ -1,4 +1,4 @@
-"""The plant's joints: what they bear before they open, how loads share out, and bodies that are clamped."""
+"""The plant's joints: the load that they bear before they open, load sharing, and clamped bodies."""
 
 import dataclasses
 
@@ -54,7 +54,7 @@ def test_hand_on_one_of_two_loads_their_joint_with_half_its_force(module: int, f
 
 @pytest.mark.parametrize("cells", [(0, 1, 2), (2, 1, 0), (2, 0, 1), (0, 2, 1)])
 def test_joints_of_a_row_that_is_clamped_at_one_end_carry_all_of_a_pull_at_the_other(cells: tuple[int, ...]) -> None:
-    """However its modules are counted: the clamp is on the first, and the load cell bears what it holds."""
+    """Whatever the order of the modules: the first one is clamped, and its load cell measures the whole pull."""
     start, along = Start(np.array([0.0, 0.0, 400.0]), LEVEL), np.array([0.21, 0.0, 0.0])
     places = [Place((cell - cells[0]) * along, LEVEL.copy()) for cell in cells]
     world = World(WorldSpec(**CALM), OCEAN, [SLIPPERY] * 3, [start] * 3, 0, PERIOD_NS, groups=[(0, 1, 2)], places=places, jam=NEVER)
@@ -91,7 +91,7 @@ def test_jet_on_one_of_two_loads_their_joint_as_a_hand_would() -> None:
 
 
 def impulse(world: World, module: int) -> np.ndarray:
-    """(6,) momentum and angular momentum about the world's origin of one module with the still water that it moves, world."""
+    """(6,) linear and angular momentum, about the world's origin, of one module and the still water that it moves; world frame."""
     truth, draw = world.truth(module), world.draw(module)
     v, w = rotations.rotate_back(truth.q_wm, truth.v_w), truth.w_b
     robot = draw.mass * (v + np.cross(w, draw.com))
@@ -102,7 +102,7 @@ def impulse(world: World, module: int) -> np.ndarray:
 
 
 def test_joint_of_a_tumbling_pair_bears_what_changes_the_momentum_of_the_other_one() -> None:
-    """Newton and Euler about the world's origin: what weight, buoyancy and an off-axis hand do not give to module 1, the joint gives."""
+    """Newton-Euler about the world's origin: the joint gives module 1 what weight, buoyancy and an off-axis external push do not."""
     uneven = {"added": np.array([3.0, 9.0, 6.0, 0.01, 0.03, 0.02]), "com_m": np.array([0.01, -0.02, 0.015]), "righting_arm_m": 0.01}
     vehicle = dataclasses.replace(SLIPPERY, inertial=dataclasses.replace(VEHICLE.inertial, **uneven))
     places = [Place(np.zeros(3), LEVEL), Place(np.array([0.21, 0.0, 0.0]), rotations.from_euler(np.pi / 2, 0.0, 0.0))]
@@ -171,7 +171,7 @@ def test_what_joins_a_clamped_body_stands_still() -> None:
 
 @pytest.mark.parametrize("held", [0, 1])
 def test_clamped_body_stays_where_it_is_when_another_locks_to_it_askew(held: int) -> None:
-    """Which gives way, and sits in the lattice."""
+    """The other body gives way, and ends up in the lattice."""
     world = two(6e-4, 8e-4, q=rotations.from_euler(0.0, 0.002, -0.004))
     world.clamp(held)
     before = world.truth(held)

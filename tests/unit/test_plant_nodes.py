@@ -1,4 +1,4 @@
-"""The simulated CAN nodes: what they answer, when their thrusters stop, and what they make of bad frames."""
+"""The simulated CAN nodes: what they answer, when their thrusters stop, and how they treat bad frames."""
 
 import collections
 import dataclasses
@@ -177,7 +177,7 @@ def test_slow_frames_count_by_one() -> None:
 
 
 def test_picture_that_was_taken_too_long_after_sync_to_say_so_is_not_sent() -> None:
-    """Its time since SYNC goes to 25.5 ms."""
+    """The frame's field for the time since SYNC ends at 25.5 ms."""
     nodes = nodes_of(dataclasses.replace(calm(), sensors=dataclasses.replace(calm().sensors, tag_rate_hz=400.0, tag_phase=0.0)))
     nodes.step([sync(1)])
     for _ in range(6):

@@ -1,4 +1,4 @@
-"""The plant in a process of its own: what is wrong on its bus is as wrong as in lockstep, tick for tick."""
+"""The plant in its own process: faults on its bus act as in lockstep, tick for tick."""
 
 import dataclasses
 from contextlib import ExitStack
@@ -23,7 +23,7 @@ PERIOD_NS = 10_000_000
 
 
 class Sent:
-    """A port that keeps what is sent."""
+    """A port that records the frames sent."""
 
     address = "virtual:sent"
 
@@ -36,7 +36,7 @@ class Sent:
 
 
 def tick_of(k: int) -> list[Frame]:
-    """What the firmware sends in a tick: the frames come one by one."""
+    """Frames that the firmware sends in a tick; they arrive one by one."""
     return [sync(k), *thrust(0.0, DISARMED, k), dock([0] * 6, k)]
 
 
@@ -78,7 +78,7 @@ def test_plant_refuses_a_bus_on_which_somebody_else_answers_as_its_module() -> N
 
 
 class Led(Sent):
-    """A bus that reaches others, and on which somebody sends SYNC."""
+    """A bus shared with other nodes, one of which sends SYNC."""
 
     address = "udp:239.74.163.5:43999"
 

@@ -27,7 +27,7 @@ def test_level_module_at_rest_feels_gravity_upwards() -> None:
 
 
 def test_module_on_its_side_feels_gravity_along_y() -> None:
-    # rolled 90 deg to the right: its y axis points down, so what holds it pushes towards -y
+    # rolled 90 deg to the right: its y axis points down, so the force that holds it points to -y
     body = at_rest(rotations.from_euler(np.pi / 2, 0.0, 0.0))
     felt = sensors().accel(body)
     assert felt[1] == pytest.approx(-9.81, abs=0.02) and abs(felt[2]) < 0.02

@@ -243,7 +243,7 @@ def test_gusts_have_the_wanted_strength_and_smoothness() -> None:
 
 
 def test_gusts_begin_as_they_go_on() -> None:
-    """Gust and where it tends, over many seeds: the covariance that two lags driven by white noise keep (Lyapunov, by scipy)."""
+    """Over many seeds, gust and gust target have the stationary covariance of two lags driven by white noise (Lyapunov, by scipy)."""
     sigma, t1, t2 = 0.3, 5.0, 1.0
     spec = WorldSpec(**{**CALM, "gust_m_s": sigma, "gust_time_s": t1, "gust_smoothing_s": t2})
     gusts = [Gusts(spec, np.random.default_rng(seed), 1e-3) for seed in range(2000)]

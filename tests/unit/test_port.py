@@ -1,4 +1,4 @@
-"""One suite for every kind of bus (tests/vcan runs it on real SocketCAN), and addresses that name none."""
+"""One suite for every kind of bus (tests/vcan runs it on real SocketCAN), and invalid addresses."""
 
 import functools
 import os
@@ -83,7 +83,7 @@ class TestSlcan(PortSuite):
         return cable.addresses
 
     def test_adapter_serves_one_process_and_the_next_one_when_it_is_done(self, pair, cable):
-        """Another would switch the channel off on opening, and an adapter does not echo: no foreign SYNC is heard."""
+        """A second process would switch the channel off on opening; and its SYNC would go unnoticed, as an adapter does not echo."""
         one, other = pair
         script = f"from firmware_py.bus.port import open_port; open_port({cable.addresses[0]!r})"
         run = functools.partial(subprocess.run, [sys.executable, "-c", script], capture_output=True, text=True, check=False)
@@ -105,7 +105,7 @@ class TestSlcan(PortSuite):
         link.close(link.open())
 
     def test_settings_of_this_machine_for_python_can_change_nothing(self, cable, monkeypatch):
-        """In ~/.canrc a listener of somebody else may be told to send nothing, or to hear its own frames."""
+        """A ~/.canrc made for another program may set the bus to listen only, or to receive its own frames."""
         monkeypatch.setenv("CAN_CONFIG", '{"listen_only": true, "rtscts": true}')
         link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))
         bus: Any = link.open()
@@ -116,7 +116,7 @@ class TestSlcan(PortSuite):
             link.close(bus)
 
     def test_silent_adapter_is_waited_for_asleep(self, cable, monkeypatch):
-        """python-can's own wait reads in a loop: at real-time priority nothing else would run on that processor."""
+        """python-can's own wait polls in a loop: at real-time priority nothing else would run on that processor."""
         link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))
         bus, reads = link.open(), []
         try:
@@ -150,7 +150,7 @@ class TestSlcan(PortSuite):
             sent += 1
         assert faults(one) == {"full": 1}
         cable.go_on()
-        assert poll(lambda: one.send(FRAMES[1]))  # and what was left of the one before it
+        assert poll(lambda: one.send(FRAMES[1]))  # and the rest of the frame before it
         assert receive(other, sent + 1) == [*(Frame(0x123, n.to_bytes(8, "little")) for n in range(sent)), FRAMES[1]]
 
     @pytest.mark.parametrize("garbage", [b"t1z38\r", b"t\r", b"t1239\r", b"t0\xff\r"])

@@ -1,4 +1,4 @@
-"""What a port does while it waits, and when its bus fails: counts, goes on, and opens it again."""
+"""What a port does while it waits, and when its bus fails: it counts the fault, goes on, and reopens the bus."""
 
 import errno
 import threading
@@ -19,7 +19,7 @@ __all__ = ["no_channel_left_open"]
 
 
 class Clock:
-    """Moves only when it is read."""
+    """A clock that moves only when it is read: to the next of the given times."""
 
     def __init__(self, *times_ns):
         self.times_ns = deque(times_ns)
@@ -57,7 +57,7 @@ def test_port_that_nothing_could_wake_refuses_to_wait():
 
 
 class Wire(can.BusABC):
-    """A python-can bus that does what the test says: each entry of a script is raised, or is what happens."""
+    """A scripted python-can bus: an entry of `sends` or `reads` that is an exception is raised, any other is the outcome."""
 
     def __init__(self):
         super().__init__(channel="wire")
@@ -76,7 +76,7 @@ class Wire(can.BusABC):
 
 
 class WireLink(Link):
-    """Opens Wires; `present` and `same` are what an interface does that is deleted and made again."""
+    """Opens Wires; `present` and `same` simulate an interface that is deleted and created again."""
 
     def __init__(self):
         super().__init__("wire")
@@ -167,7 +167,7 @@ def test_interface_that_does_not_open_yet_is_tried_again(port, link):
         port.receive()
         reads += 1
     assert len(link.wires) == 2
-    # Once, and then every 17th read: opening is slow.
+    # One attempt, then one every 17th read, because opening is slow.
     assert reads == 1 + 1 + 2 * 17
 
 

@@ -1,4 +1,4 @@
-"""What the water sees of a shape: exact outlines against closed forms, and the paper's alpha shape against them."""
+"""Projected areas of shapes: exact outlines against closed forms, and the paper's alpha shape against the exact outlines."""
 
 import dataclasses
 import math
@@ -32,7 +32,7 @@ def solids(cells: Cells) -> list[Solid]:
 
 
 def fibonacci(n: int) -> np.ndarray:
-    """(n, 3) directions: the paper's Algorithm 1 with the pole put right (errata)."""
+    """(n, 3) directions: the paper's Algorithm 1 with the pole corrected (errata)."""
     i = np.arange(n)
     phi, theta = np.arccos(1.0 - (2 * i + 1) / n), math.pi * (1.0 + math.sqrt(5.0)) * i
     return np.stack([np.cos(theta) * np.sin(phi), np.sin(theta) * np.sin(phi), np.cos(phi)], axis=1)
@@ -88,7 +88,7 @@ def test_convex_hull_would_overestimate_an_elbow() -> None:
     shapes = outlines(solids(ELBOW), fibonacci(1000))
     excess = shapely.area(shapely.convex_hull(shapes)) / shapely.area(shapes) - 1.0
     assert excess.mean() == pytest.approx(0.056, abs=0.002)
-    assert excess.max() == pytest.approx(0.157, abs=0.006)  # 1/6 from above, if a direction is there
+    assert excess.max() == pytest.approx(0.157, abs=0.006)  # 1/6 exactly from above, if that direction is sampled
 
 
 def test_opposite_directions_see_the_same_outline() -> None:

@@ -65,19 +65,19 @@ def differences(function: Callable[[np.ndarray], np.ndarray], x: np.ndarray, h: 
 
 
 def transition(x: np.ndarray, dt: float, body: Body, tau: np.ndarray = TAU) -> np.ndarray:
-    """(28, 28) the whole of F."""
+    """(28, 28) the full transition matrix F."""
     still = np.eye(ERRORS)[propagation.MOVING :]
     return np.vstack([propagation.transition(x, tau, dt, *body.plant), still])
 
 
 def stepped(x: np.ndarray, body: Body, after: np.ndarray, dt: float) -> np.ndarray:
-    """Where `x` is a step later, as the error from `after`."""
+    """State one step after `x`, as the error from `after`."""
     return error_between(propagation.step(x, TAU, dt, *body.plant), after)
 
 
 @pytest.fixture(scope="module", params=range(5))
 def jacobians(body: Body, request: pytest.FixtureRequest) -> tuple[np.ndarray, np.ndarray]:
-    """(F - I) / dt as the estimator has it, and by finite differences of the step."""
+    """(F - I) / dt as the estimator computes it, and by finite differences of the step."""
     x = state(request.param)
     step = partial(stepped, body=body, after=propagation.step(x, TAU, DT, *body.plant), dt=DT)
     numeric = differences(step, x)
@@ -186,7 +186,7 @@ def test_carried_rate_is_the_gyros_less_its_bias(body: Body) -> None:
 
 
 def test_carried_pose_is_as_uncertain_as_its_derivatives_say(body: Body) -> None:
-    """Variance after carrying for 0.2 s by a given gyro, against finite differences of the carrying itself."""
+    """Variance after carrying for 0.2 s by given gyro samples, against finite differences of the carrying itself."""
     x = state(0)
     x[7:13] *= 0.1
     gyros = np.tile(x[10:13] + x[13:16], (20, 1))
@@ -238,7 +238,7 @@ def test_inertial_jacobian_is_the_derivative_of_the_residual(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_accelerometer_s_jacobian_is_the_derivative_by_tilt_bias_and_disturbance(seed: int, body: Body) -> None:
-    """That by the velocity, a change of drag, is left out: 0.4 m/s^2 for each m/s, where the velocity is known to a centimetre."""
+    """The derivative by velocity (drag) is left out: 0.4 m/s^2 per m/s, while velocity is known to a centimetre per second."""
     x, gyro, accel = state(seed), np.full(3, np.nan), np.array([0.5, -0.2, -9.7])
     mobility = np.ascontiguousarray(body.mass_inv[:3, :3])
 
@@ -252,7 +252,7 @@ def test_accelerometer_s_jacobian_is_the_derivative_by_tilt_bias_and_disturbance
 
 
 def test_accelerometer_of_a_level_robot_at_rest_points_up() -> None:
-    """It feels what holds it: -g along z, which is down."""
+    """It measures the force that holds it: -g along z, which points down."""
     x = np.zeros(32)
     x[3] = 1.0
     residual, _, _ = observation.inertial(x, np.zeros(3), np.array([0.0, 0.0, -9.80665]), 0.0, np.ones(3), np.zeros(3), np.zeros((3, 3)))
@@ -303,7 +303,7 @@ def test_sensor_that_did_not_come_has_no_row(gyro: bool, accel: bool, depth: boo
 
 
 def measurement(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Covariance, residual, Jacobian and variances of any measurement."""
+    """Covariance, residual, Jacobian and variances of a random measurement."""
     rng = np.random.default_rng(seed)
     half = rng.normal(size=(ERRORS, ERRORS))
     return half @ half.T, 0.1 * rng.normal(size=6), rng.normal(size=(6, ERRORS)), rng.uniform(1, 2, 6)

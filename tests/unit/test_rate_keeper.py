@@ -12,7 +12,7 @@ PERIOD_NS = 10_000_000
 
 
 class ManualClock:
-    """Time that stands until it is set."""
+    """A clock that stands still until it is set."""
 
     def __init__(self, start_ns: int = 0) -> None:
         self._now_ns = start_ns
@@ -133,7 +133,7 @@ def test_period_must_be_positive() -> None:
 
 
 def test_machine_that_slept_an_hour_finds_that_it_missed_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As a process that stood still does, which disarms: CLOCK_MONOTONIC stands while a laptop's lid is shut."""
+    """System sleep counts as a stall, which disarms: CLOCK_MONOTONIC stands still while a laptop's lid is shut."""
     hour_ns, now_ns = 3_600_000_000_000, {time.CLOCK_MONOTONIC: 0, time.CLOCK_BOOTTIME: 0}
     monkeypatch.setattr(time, "clock_gettime_ns", now_ns.__getitem__)
     keeper = RateKeeper(10_000_000, MonotonicClock.started_now(), lambda deadline_ns: None)

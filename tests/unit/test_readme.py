@@ -1,4 +1,4 @@
-"""README.md and the pages of docs/: what they name exists, and their tables of figures are written by a tool."""
+"""README.md and the pages of docs/: the files and functions they name exist, and a tool writes their tables of figures."""
 
 import ast
 import importlib.util
@@ -20,7 +20,7 @@ PLACES = sorted({
 
 
 def tool(name: str) -> ModuleType:
-    """A script of tools/ as a module."""
+    """Imports a script of tools/ as a module."""
     spec = importlib.util.spec_from_file_location(name, ROOT / "tools" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -152,7 +152,7 @@ TOOLS = sorted((ROOT / "tools").glob("*.py"))
 
 @pytest.mark.parametrize("path", [*PAGES, *TOOLS], ids=lambda path: str(path.relative_to(ROOT)))
 def test_shown_command_of_a_tool_starts_with_the_python_that_has_its_packages(path: Path) -> None:
-    """In pages and in the tools' usage; the tables of figures say once, above, which python theirs is."""
+    """In the pages and in the tools' usage; the tables of figures are exempt, as a note above them says once which python they use."""
     text = path.read_text(encoding="utf-8")
     if path.suffix == ".py":
         text = ast.get_docstring(ast.parse(text)) or ""

@@ -1,4 +1,4 @@
-"""Ticks against the clock: whoever watches them may fail, and they go on."""
+"""Ticks in real time: they go on when an observer fails."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing

@@ -1,4 +1,4 @@
-"""What a process asks of the system to keep its deadlines, and that it flies without what it is refused."""
+"""What a process asks of the operating system to keep its deadlines, and that it flies without whatever is refused."""
 
 import ctypes
 import errno
@@ -100,7 +100,7 @@ def test_compiler_whose_pages_were_given_back_still_compiles() -> None:
 
 
 def test_libraries_are_read_to_their_end_before_the_flight_and_the_compiler_is_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # Whoever reads a pipe waits for who writes it: here only the library is written.
+    # A reader of a FIFO blocks until somebody writes it; only the library is written here, so reading another would hang.
     library, shared, compiler = (tmp_path / name for name in ("a l\udcefbrary.so", "shared", "libllvmlite.so"))
     for path in (library, shared, compiler):
         os.mkfifo(path)
@@ -123,7 +123,7 @@ def test_libraries_are_read_to_their_end_before_the_flight_and_the_compiler_is_n
         thread.join(20.0)
         assert not thread.is_alive()
     monkeypatch.setattr(realtime, "_MAPS", tmp_path)
-    realtime.read_libraries()  # where the system does not tell
+    realtime.read_libraries()  # where the system provides no list of mappings
 
 
 def test_helper_whose_vehicle_has_ended_already_ends_too() -> None:

@@ -1,4 +1,4 @@
-"""The recorder's files: readable by the tools that others wrote, the same for the same run, whole up to a tear."""
+"""The recorder's files: readable by third-party tools, identical for identical runs, and intact up to a tear."""
 
 import errno
 from dataclasses import dataclass

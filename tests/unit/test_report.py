@@ -1,4 +1,4 @@
-"""What a run leaves for people: plots, a report that opens without a network, and the table in the terminal."""
+"""Output of a run for people: plots, a report that opens without a network, and the table in the terminal."""
 
 import base64
 import dataclasses
@@ -96,7 +96,7 @@ def test_grey_of_every_plot_over_time_is_in_its_legend(flight: Flight) -> None:
 
 
 def test_panel_says_why_it_is_empty_where_the_filter_has_nothing_to_show(flight: Flight) -> None:
-    """The paper's filter tells no innovations and estimates no disturbance."""
+    """The paper's filter reports no innovations and estimates no disturbance."""
     silent = {name: np.zeros_like(flight.firmware[name]) for name in ("nis", "nis_dof", "force_w", "moment_b")}
     for draw, titles, why in (
         (estimate, ["Tag NIS per degree of freedom: none"], "this filter tells no innovations"),
@@ -195,7 +195,7 @@ def test_markup_in_a_title_stays_text(flight: Flight, result: Result, tmp_path: 
 
 
 def test_plots_judge_a_robot_that_does_not_follow_as_the_table_does(flight: Flight) -> None:
-    """By the same reference, which it was not told, and over the same ticks."""
+    """By the same reference, which the robot was never given, and over the same ticks."""
     hover = load_scenario("hover")
     task = dataclasses.replace(hover.task, settle_s=START_NS / 1e9, duration_s=WINDOW.end_s - WINDOW.start_s)
     scenario = dataclasses.replace(hover, task=task)

@@ -1,4 +1,4 @@
-"""Whatever is asked for: what makes no sense or reaches nobody is refused in words, and the robot flies on as it did."""
+"""Requests that make no sense or name no existing body are refused in words, and the robot flies on as before."""
 
 import math
 from typing import Any
@@ -22,7 +22,7 @@ STICKS = Sticks((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
 
 
 class Path:
-    """A trajectory that may be spoilt."""
+    """A trajectory that may be invalid."""
 
     def __init__(self, point: Any = HERE, duration_s: Any = 2.0) -> None:
         self.point, self.duration_s = point, duration_s
@@ -136,7 +136,7 @@ def test_sound_requests_keep_their_order_and_the_others_are_answered() -> None:
 
 
 def test_disarm_reaches_every_body_that_has_a_module_of_the_one_that_it_names() -> None:
-    """In the tick in which bodies part or join: 0 and 1 were one body, or are one now; body 2 is another."""
+    """In the tick in which bodies part or join: modules 0 and 1 were one body, or are one now; body 2 is separate."""
     other = single(2)
     apart, joined = [*APART.values(), other], [PAIR, other]
     requests = [Request(Action.DISARM, 0), Request(Action.ARM, 0), Request(Action.DISARM, 2)]
@@ -149,7 +149,7 @@ def test_disarm_reaches_every_body_that_has_a_module_of_the_one_that_it_names() 
 
 
 def test_robot_flies_on_through_every_request_without_sense() -> None:
-    """All of them at once, in every tick of a second: nothing raises, nothing moves, every one is answered."""
+    """All of them in one tick, ten times within a second: nothing raises, nothing moves, every one is answered."""
     tank = Tank([single()])
     tank.run(0.5)
     tank.run(3.0, Request(Action.ARM))
@@ -164,7 +164,7 @@ def test_robot_flies_on_through_every_request_without_sense() -> None:
 
 
 def test_place_with_a_hole_in_it_does_not_poison_the_set_point() -> None:
-    """Once a NaN is in the glider, it stays there."""
+    """A NaN in the glider's state would never leave it."""
     tank = Tank([single()])
     tank.run(0.5)
     tank.run(1.0, Request(Action.ARM))
@@ -176,7 +176,7 @@ def test_place_with_a_hole_in_it_does_not_poison_the_set_point() -> None:
 
 
 def test_dock_that_cannot_be_prepared_leaves_the_body_holding_its_place() -> None:
-    """Probe against probe: known only when it is prepared, after the mode was taken."""
+    """Probe against probe is found only in preparation, after the mode has changed."""
     from firmware_py.core.docking_decisions import Prepared
 
     tank = Tank([single(0), single(1)])

@@ -1,4 +1,4 @@
-"""Quaternions against scipy's Rotation, which is scalar last and knows nothing of this code."""
+"""Quaternions against scipy's Rotation, which is scalar-last and independent of this code."""
 
 import math
 
@@ -18,7 +18,7 @@ def from_scipy(rotation: Rotation) -> np.ndarray:
 
 
 def attitudes() -> list[np.ndarray]:
-    """Random ones and the awkward ones: none, half-turns, pitch 90 degrees, a negative scalar part."""
+    """Random attitudes and edge cases: identity, half-turns, pitch 90 degrees, a negative scalar part."""
     random = list(from_scipy(Rotation.random(12, rng=np.random.default_rng(1))))
     half_turns = [np.roll(np.array([1.0, 0.0, 0.0, 0.0]), k) for k in range(4)]
     upright = [rotations.from_euler(0.3, 0.5 * math.pi, -0.2), rotations.from_euler(0.0, -0.5 * math.pi, 1.0)]

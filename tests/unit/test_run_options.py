@@ -1,4 +1,4 @@
-"""`modcube run` takes no option that it would not use: each is refused in one line, with status 2, before anything is started."""
+"""`modcube run` refuses each option that it would not use: in one line, with status 2, before anything is started."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -28,14 +28,14 @@ from tests.unit.tanks import Docked
 FOLDER = Path(load_scenario.__code__.co_filename).parent / "scenarios"
 Load = Callable[..., Scenario]
 WHOLE_BUS = ("estop", "foreign_sync", "foreign_command", "process_killed")
-"""Faults that are of no module."""
+"""Kinds of faults that concern no single module."""
 DOCK_STEP = '[[step]]\ndo = "dock"\nmodule = 2\nface = "-x"\ntarget_module = 1\ntarget_face = "+x"\n'
 SECOND = '[[module]]              # the active one, on the right\nnumber = 2\nvehicle = "modcube"\nposition_m = [0.40, 0.0, 0.38]\n'
 
 
 @pytest.fixture
 def load(tmp_path: Path) -> Load:
-    """load(name, old, new): a shipped scenario with `new` in place of `old`, or `new` at its end."""
+    """load(name, old, new): a shipped scenario with `new` in place of `old`, or appended if `old` is empty."""
 
     def load_it(name: str, old: str, new: str) -> Scenario:
         text = (FOLDER / f"{name}.toml").read_text(encoding="utf-8")
@@ -202,7 +202,7 @@ def test_scenario_of_the_package_has_no_mistake(name: str) -> None:
 
 
 def test_wait_is_about_no_module(load: Load) -> None:
-    """Its defaults name modules that need not be there."""
+    """The modules that a `wait` step names by default need not exist."""
     scenario = load("dock", DOCK_STEP, '[[step]]\ndo = "wait"\n')
     renumbered = dataclasses.replace(scenario, module=tuple(dataclasses.replace(m, number=m.number + 2) for m in scenario.module))
     script = DockScript(renumbered, fleet_of(renumbered, "virtual:wait", 100))
@@ -250,7 +250,7 @@ position_m = [0.2, 0.1, 0.4]
 
 
 def waypoints(folder: Path, text: str, name: str = "path.csv", euler_deg: str = "[0, 0, 0]") -> Scenario:
-    """The shipped scenario with `text` as its file, out of `folder`, its module turned."""
+    """The shipped scenario, loaded from `folder` with `text` as its waypoint file and its module turned by `euler_deg`."""
     folder.mkdir(exist_ok=True)
     (folder / name).write_text(text, encoding="utf-8")
     scenario = (FOLDER / "waypoints.toml").read_text(encoding="utf-8").replace("waypoints.csv", name)
@@ -292,7 +292,7 @@ def test_free_durations_are_as_short_as_the_limits_allow_and_the_rest_of_the_tas
 
 
 def test_scenario_flies_the_same_path_where_its_file_is_not(tmp_path: Path) -> None:
-    """As on the workers of a cluster; and its campaign goes on only with the same points."""
+    """As on the workers of a cluster. A campaign is resumed only with the same waypoints."""
     here, parameters = waypoints(tmp_path / "here", PATH), Parameters()
     there = waypoints(tmp_path / "there", PATH)
     assert identity(here, parameters) == identity(there, parameters)

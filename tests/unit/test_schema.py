@@ -1,4 +1,4 @@
-"""Reading TOML: what is wrong is refused with file, line and what would be right; the rest comes through as written."""
+"""Reading TOML: mistakes are refused with file, line and remedy; everything else is read as written."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -77,7 +77,7 @@ def load(folder: Path, text: str) -> Boat:
 
 
 def refusal(folder: Path, text: str) -> str:
-    """The error without the folder; always one line."""
+    """The error message without the folder; checks that it is one line."""
     with pytest.raises(DescriptionError) as caught:
         load(folder, text)
     words = str(caught.value)

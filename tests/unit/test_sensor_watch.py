@@ -1,4 +1,4 @@
-"""An IMU that repeats itself and a reading that leaps are noticed, and not measured with; the body flies on without."""
+"""Samples of a frozen IMU and readings that leap are detected and not used; the body flies on without them."""
 
 import math
 
@@ -22,7 +22,7 @@ def sample(value: float, accel: float = 9.8) -> ModuleInputs:
 
 
 def hears(watch: SensorWatch, *modules: ModuleInputs) -> bool:
-    """Whether an IMU is believed in a tick of these inputs."""
+    """Whether any IMU is believed in a tick with these inputs."""
     watch.step(modules)
     return watch.imu_heard
 
@@ -44,7 +44,7 @@ def test_one_number_that_changes_is_a_sensor_that_lives(change: str) -> None:
 
 @pytest.mark.parametrize("broken", ["gyro", "accel"])
 def test_imu_that_leaps_with_every_sample_is_not_heard(broken: str) -> None:
-    """Or the fail-safe `imu_lost` would never know that nothing of it is believed."""
+    """Otherwise the fail-safe `imu_lost` would not act although no sample is believed."""
     watch, rng = SensorWatch([0]), np.random.default_rng(0)
     for n in range(100):
         module = sample(0.1 + 1e-3 * (n % 2))
@@ -122,7 +122,7 @@ def test_body_that_takes_over_knows_which_imu_is_frozen_and_what_was_believed_of
 
 
 def test_frozen_imu_is_left_out_of_the_mean() -> None:
-    """The other stands 0.105 m off the centre of mass, and feels 0.21 m/s^2 of a turn at 1 rad/s about each axis."""
+    """The other IMU is 0.105 m off the centre of mass: a rate of 1 rad/s about each axis accelerates it by 0.21 m/s^2."""
     watch, fuse = SensorWatch(PAIR.modules), Measurements(PAIR, PERIOD).fuse
     both = fuse(watch.step([sample(1.0, 4.0), sample(3.0, 8.0)]), LEVEL)
     for n in range(REPEATS + 1):
@@ -158,7 +158,7 @@ def test_robot_whose_imu_freezes_holds_its_place_and_says_so() -> None:
 
 
 def readings(*values: float, name: str) -> list[bool]:
-    """Which of the readings, in multiples of what counts as a leap, are believed."""
+    """Which of the readings, given in multiples of the leap threshold, are believed."""
     watch = SensorWatch([0])
     samples = [value * LEAPS[name] for value in values]
     inputs = [ModuleInputs(**{name: x if name == "pressure_pa" else np.array([0.0, x, 0.0])}) for x in samples]  # type: ignore[arg-type]
@@ -176,7 +176,7 @@ def test_reading_that_leaps_is_left_out_and_one_that_stays_there_is_believed(nam
 
 @pytest.mark.parametrize(("name", "moved", "leapt"), [("gyro", 0.7, 1.1), ("accel", 1.2, 2.1), ("pressure_pa", 1900.0, 2100.0)])
 def test_leap_is_more_than_thrusters_make_in_a_tick_of_20_ms_and_twenty_centimetres_of_water(name: str, moved: float, leapt: float) -> None:
-    """Full moment from none, 0.7 rad/s; a force that is reversed, 1.2 m/s^2."""
+    """Full moment from zero gives 0.7 rad/s, a reversed force 1.2 m/s^2."""
     for step, believed in ((moved, True), (leapt, False)):
         assert readings(0.0, step / LEAPS[name], name=name) == [True, believed]
 
@@ -190,7 +190,7 @@ def test_only_the_reading_that_leaps_is_left_out() -> None:
 
 @pytest.mark.parametrize(("name", "off"), [("gyro", 35.0), ("accel", 50.0), ("pressure_pa", 1e5)])
 def test_one_wrong_reading_does_not_move_the_robot(name: str, off: float) -> None:
-    """Without the watch it moves 50 to 200 mm."""
+    """Without the sensor watch it moves 50 to 200 mm."""
     tank = Tank([single()])
     tank.run(0.5)
     tank.run(2.0, Request(Action.ARM))

@@ -1,4 +1,4 @@
-"""The glider: takes up speeds smoothly, arrives without overshoot, and does not depend on the tick."""
+"""The glider: changes speed smoothly, arrives without overshoot, and does not depend on the tick period."""
 
 import numpy as np
 import pytest
@@ -68,7 +68,7 @@ def test_axis_without_a_place_goes_by_its_speed() -> None:
 
 
 def test_set_point_never_jumps() -> None:
-    """Whatever is wished, from one tick to the next."""
+    """Whatever the wish changes to from one tick to the next."""
     rng, moved = np.random.default_rng(0), glider()
     for _ in range(300):
         before = moved.at

@@ -1,4 +1,4 @@
-"""Thrusters of a module that falls silent: left out where the others can stand in, and used again once it is heard."""
+"""Thrusters of a silent module: excluded where the others can replace them, and used again once the module is heard."""
 
 import numpy as np
 
@@ -13,7 +13,7 @@ ZERO = np.zeros(3)
 
 
 class Pair:
-    """Two docked modules, of which a detector hears some."""
+    """Docked modules, two by default, of which a fault detector hears some."""
 
     def __init__(self, count: int = 2) -> None:
         cube = load_vehicle("modcube")
@@ -21,7 +21,7 @@ class Pair:
         self.detector = FaultDetector(self.body, Faults(), TICK_NS)
 
     def hear(self, seconds: float, *heard: int, armed: bool = True) -> list[str]:
-        """Words of that time."""
+        """Runs the detector with only the modules `heard` answering; returns its messages."""
         said, n = [], self.body.thrusters.f_max.size
         modules = [ModuleInputs(heard=m in heard) for m in range(len(self.body.modules))]
         estimate = Estimate(ZERO, np.eye(1, 4)[0], np.zeros(6), ZERO, ZERO, ZERO, ZERO, 0, 1.0, 6, 0, True)
@@ -33,7 +33,7 @@ class Pair:
 
     @property
     def used(self) -> set[int]:
-        """Modules whose thrusters all are."""
+        """Modules whose thrusters are all in use."""
         alive, module = self.detector.now.alive, self.body.thrusters.module
         return {m for m in range(len(self.body.modules)) if alive[module == m].all()}
 
@@ -62,7 +62,7 @@ def test_module_that_falls_silent_after_all_others_is_used_blindly_and_that_is_s
 
 
 def test_thrusters_that_no_others_can_stand_in_for_are_used_blindly() -> None:
-    """The bus may be broken in one direction alone; where all of it is, the modules stop by themselves, and a fail-safe disarms."""
+    """The bus may be broken in one direction only; if it is broken in both, the modules stop by themselves, and a fail-safe disarms."""
     for pair, heard in ((Pair(1), ()), (Pair(2), ())):
         assert pair.hear(1.0, *heard) == [] and pair.detector.now.dead == ()
 

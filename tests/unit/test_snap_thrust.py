@@ -1,4 +1,4 @@
-"""What a body can fly whose thrusters span fewer than six axes: the rest is left to buoyancy, within bounds."""
+"""Paths of bodies whose thrusters span fewer than six axes: the rest is left to buoyancy, within bounds."""
 
 import dataclasses
 import math
@@ -35,7 +35,7 @@ def bluerov2() -> Body:
 
 @pytest.fixture(params=["bluerov2", "girona500"])
 def passive(request: pytest.FixtureRequest) -> Body:
-    """A vehicle that leaves an axis to buoyancy: pitch, roll."""
+    """A vehicle that leaves an axis to buoyancy: pitch (bluerov2) or roll (girona500)."""
     return assemble_vehicle(load_vehicle(request.param))
 
 
@@ -49,7 +49,7 @@ def flown(found: Plan) -> Trajectory:
 
 
 def without_sway(body: Body) -> Body:
-    """The same with thrusters that push nothing sideways."""
+    """The same body with thrusters that give no sideways force."""
     matrix = body.thrusters.matrix.copy()
     matrix[1] = 0.0
     return dataclasses.replace(body, thrusters=dataclasses.replace(body.thrusters, matrix=matrix, pinv=np.linalg.pinv(matrix)))
@@ -71,7 +71,7 @@ def test_vehicle_that_leaves_an_axis_to_buoyancy_has_its_missions_planned(passiv
 @pytest.mark.slow
 @pytest.mark.parametrize("place", [NORTH, EAST, 5.0 * NORTH], ids=["north", "east", "far and deep"])
 def test_mission_of_such_a_vehicle_is_flown_and_it_leans_no_more_than_planned(passive: Body, place: np.ndarray) -> None:
-    """As fast as it can: the moment of the added mass, which tips a body under way, counts beside buoyancy."""
+    """Flown as fast as it can: the moment of the added mass, which tips a moving body, counts beside buoyancy."""
     period_s = 0.01
     path = flown(plan_mission(job(place, speed_m_s=1.5), passive))
     controller, allocator = Controller(passive, Control()), Allocator(passive, Allocation())
@@ -90,7 +90,7 @@ def test_mission_of_such_a_vehicle_is_flown_and_it_leans_no_more_than_planned(pa
 
 
 def test_lean_is_the_angle_at_which_buoyancy_gives_the_moment(bluerov2: Body) -> None:
-    """Held at a pitch that no thruster gives, it stays level: as far off as it was to be pitched, by the tangent."""
+    """At a wanted pitch that no thruster can hold, the vehicle stays level: its lean is the tangent of that pitch."""
     motion = np.zeros((2, 19))
     motion[0, 3:7], motion[1, 3:7] = rotations.from_euler(0.0, 0.15, 0.4), rotations.from_euler(0.3, 0.0, -1.0)
     found = divide(bluerov2, motion)
@@ -101,7 +101,7 @@ def test_lean_is_the_angle_at_which_buoyancy_gives_the_moment(bluerov2: Body) ->
 
 
 def asked_of(body: Body, attitude: Rotation, v_w: np.ndarray, w_w: np.ndarray, a_w: np.ndarray, alpha_w: np.ndarray) -> np.ndarray:
-    """(6,) wrench, body frame, of a motion of the world in water without drag: Kirchhoff and the moment of buoyancy, by numpy."""
+    """(6,) wrench, body frame, that a motion given in the world needs without drag: Kirchhoff and the moment of buoyancy, by numpy."""
     v, w, a, alpha, up = (attitude.inv().apply(each) for each in (v_w, w_w, a_w, alpha_w, [0.0, 0.0, -1.0]))
     momentum = body.mass @ np.r_[v, w]
     change = body.mass @ np.r_[a - np.cross(w, v), alpha]
@@ -110,7 +110,7 @@ def asked_of(body: Body, attitude: Rotation, v_w: np.ndarray, w_w: np.ndarray, a
 
 
 def test_vehicle_that_leans_goes_on_turning_about_the_same_axes_of_the_world(passive: Body) -> None:
-    """What its wheeling adds to the stiffness of buoyancy counts in the lean, and in what is left to the thrusters."""
+    """What the turning adds to the stiffness of buoyancy counts in the lean and in the wrench left to the thrusters."""
     drag = dataclasses.replace(passive.drag, nodes=0.0 * passive.drag.nodes, rotational=np.zeros(3), linear=np.zeros(6))
     body = dataclasses.replace(passive, drag=drag)
     attitude = Rotation.from_euler("xyz", [0.05, -0.04, 0.9])
@@ -160,7 +160,7 @@ def test_attitude_that_neither_thrusters_nor_buoyancy_hold_is_refused(bluerov2: 
 
 
 def test_push_along_an_axis_without_thrusters_is_refused_at_any_speed(bluerov2: Body) -> None:
-    """Buoyancy does not push sideways; what needs no such push is planned."""
+    """Buoyancy does not push sideways; a mission that needs no such push is planned."""
     body = without_sway(bluerov2)
     assert plan_mission(job(NORTH), body).trajectory is not None
     found = plan_mission(job(EAST), body)
@@ -207,13 +207,13 @@ def modcube() -> Body:
 
 
 def by_pseudo_inverse(body: Body, wanted: np.ndarray) -> np.ndarray:
-    """(k,) shares of wrenches (k, 6) that the pseudo-inverse asks for."""
+    """(k,) share of the thrusters' range that each of the wrenches (k, 6) takes by the pseudo-inverse."""
     forces = wanted @ body.thrusters.pinv.T
     return np.asarray(np.maximum(forces / body.thrusters.f_max, forces / body.thrusters.f_min).max(axis=1))
 
 
 def test_wrench_that_takes_too_much_is_found_among_any_number_that_only_look_worse(modcube: Body) -> None:
-    """By the pseudo-inverse, which uses thrusters that the best division would spare."""
+    """They look worse by the pseudo-inverse, which uses thrusters that the best division would spare."""
     wanted = np.random.default_rng(3).normal(size=(400, 6)) * [10.0, 10.0, 10.0, 1.0, 1.0, 1.0]
     exact = np.array([least_usage(modcube, w)[0] for w in wanted])
     looks = by_pseudo_inverse(modcube, wanted) / exact

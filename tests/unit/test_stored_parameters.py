@@ -1,4 +1,4 @@
-"""What ground stations stored and what a process is started with: a changed value stays changed, and nothing else is held fast."""
+"""Parameters stored by ground stations, laid over those that a process starts with: changed values persist, and no others."""
 
 import tomllib
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""The supervisor runs its table: every row, every trigger without one, every refusal in its words, e-stop and endings."""
+"""The supervisor runs its table: every row, every trigger without a row, refusals in words, e-stop, and activities that end."""
 
 import itertools
 from dataclasses import replace
@@ -142,7 +142,7 @@ def test_requested_e_stop_is_raised_on_the_bus_until_it_is_cleared() -> None:
 
 
 def test_requested_e_stop_outlives_a_clear_of_the_same_tick() -> None:
-    """Two people press at once, or a radio brings both in one burst: one who asks for an e-stop gets it, and the modules hear of it."""
+    """Two people act at once, or a radio delivers both requests in one burst: the e-stop wins, and the modules hear of it."""
     supervisor = supervisor_in()
     decisions = supervisor.step(False, GOOD, [Request(Action.ESTOP), Request(Action.CLEAR_ESTOP)])
     assert [decision.trigger for decision in decisions] == [Trigger.ESTOP] and supervisor.raises_estop
@@ -151,7 +151,7 @@ def test_requested_e_stop_outlives_a_clear_of_the_same_tick() -> None:
 
 
 def test_robot_that_raised_an_e_stop_itself_is_armed_once_its_modules_have_let_go() -> None:
-    """They let go when no frame came for 200 ms, and only of a robot that is disarmed."""
+    """Modules release an e-stop 200 ms after its last frame, and only if the robot is disarmed."""
     supervisor = supervisor_in()
     ask(supervisor, Action.ESTOP)
     ask(supervisor, Action.CLEAR_ESTOP, None, at(GOOD, 1.0))
@@ -177,7 +177,7 @@ def test_module_that_heard_an_e_stop_which_the_firmware_missed_stops_the_robot()
 
 
 def test_e_stop_that_was_raised_before_the_process_started_is_latched_until_a_person_clears_it() -> None:
-    """Its modules hold it, and let go by themselves once they hear that the robot is disarmed: nobody cleared it by that."""
+    """The modules hold the e-stop, and release it by themselves once they hear that the robot is disarmed; that does not clear it."""
     supervisor = supervisor_in(State.DISARMED)
     stopped = GOOD._replace(stopped=(0,))
     (decision,) = supervisor.step(False, stopped, [Request(Action.ARM)])
@@ -264,7 +264,7 @@ def test_mode_taken_during_a_motor_test_ends_it_without_disarming() -> None:
 
 @pytest.mark.parametrize(("action", "argument"), [(Action.SET_MODE, Mode.MANUAL), (Action.HOLD, None), (Action.TRACK, None)])
 def test_motor_test_is_no_way_round_the_arming_checks(action: Action, argument: object) -> None:
-    """It passes over those that may be skipped, as a forced ARM does; nobody has said that the robot is to be flown so."""
+    """A motor test skips the checks that may be skipped, as a forced ARM does, but nobody asked to fly the robot in that condition."""
     bad = GOOD._replace(frame_errors_per_s=1e6)
     supervisor = supervisor_in(State.DISARMED)
     assert ask(supervisor, Action.MOTOR_TEST, (0, 0.1, 1.0), bad) and supervisor.armed
@@ -289,7 +289,7 @@ def test_motor_test_in_another_mode_is_refused() -> None:
 
 
 def test_what_has_ended_ends_before_what_is_asked_for_begins() -> None:
-    """No test runs before the tick in which one is asked for, and a dock that is over is not the next one."""
+    """TEST_OVER is given while no test runs, so also in the tick that starts one; DOCK_OVER of a past dock must not end the next."""
     supervisor = supervisor_in(State.DISARMED)
     supervisor.step(False, GOOD, [Request(Action.MOTOR_TEST, 0, (0, 0.1, 1.0))], [Trigger.TEST_OVER])
     assert supervisor.armed and supervisor.mode == Mode.MOTOR_DETECT

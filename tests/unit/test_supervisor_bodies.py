@@ -1,4 +1,4 @@
-"""The supervisor of a body that joins or parts goes on from those before."""
+"""The supervisor of a joined or parted body takes over from those of the previous bodies."""
 
 import pytest
 
@@ -95,7 +95,7 @@ def test_joined_robot_keeps_e_stop_and_fail_safe() -> None:
 
 
 def test_milder_fail_safe_does_not_end_surfacing() -> None:
-    """Whoever chose it: a robot on its way up is not made to hold its place."""
+    """Whoever chose SURFACE: a robot on its way up is not made to hold its place."""
     health = GOOD._replace(silent_s=0.6)
     supervisor = supervisor_in(mode=Mode.SURFACE)
     supervisor.step(False, health, [])

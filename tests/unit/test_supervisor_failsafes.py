@@ -1,4 +1,4 @@
-"""What fail-safes make of the mode: what acts, what is permitted meanwhile, what comes back, and what is said."""
+"""Fail-safes and the mode: which one acts, what is permitted meanwhile, what recurs, and what is reported."""
 
 from dataclasses import replace
 
@@ -114,7 +114,7 @@ SPELLS = {
     "outside the fence": (Mode.GUIDED, "outside_m", 0.1, Mode.POSHOLD),
     "leak": (Mode.ALT_HOLD, "leak", True, Mode.SURFACE),
 }
-"""A mode, what goes wrong in it, and where its fail-safe leads."""
+"""A mode, the health figure that goes wrong in it and its value, and the mode that the fail-safe enters."""
 
 
 @pytest.mark.parametrize("spell", SPELLS)
@@ -161,7 +161,7 @@ def test_fail_safe_during_a_motor_test_disarms(base: Health, figure: str, value:
 
 @pytest.mark.parametrize("rest", ["e-stop", "ESTOP", "DISARM"])
 def test_body_that_comes_to_rest_keeps_no_mode_that_no_person_chose(rest: str) -> None:
-    """Armed again it would dock, surface or turn every thruster, without a pose and without being asked."""
+    """Armed again in such a mode, it would dock, surface or turn every thruster, unasked and without a pose."""
 
     def after(supervisor: Supervisor, health: Health = GOOD) -> Mode:
         supervisor.step(rest == "e-stop", health, [] if rest == "e-stop" else [Request(Action[rest], 0, None)])
@@ -249,7 +249,7 @@ def test_fail_safe_holds_as_well_as_can_be(health: Health, mode: Mode, refusals:
 
 
 def test_robot_without_tags_holds_then_holds_depth_then_surfaces() -> None:
-    """As the issue has it: POSHOLD, then depth and attitude, then up."""
+    """As the issue specifies: POSHOLD, then depth and attitude, then up."""
     supervisor = supervisor_in(mode=Mode.AUTO)
     seen = []
     for tenth in range(0, 400):
@@ -265,7 +265,7 @@ def test_pilots_depth_hold_needs_no_tags() -> None:
 
 @pytest.mark.parametrize(("figure", "value"), [("imu_age_s", 0.6), ("pilot_age_s", 1.1)])
 def test_pilots_depth_hold_without_tags_is_his_again_when_the_fail_safe_that_kept_it_is_over(figure: str, value: float) -> None:
-    """A moment without IMU or sticks brought the robot up 22 s later, with its pilot at the sticks. Others may warn meanwhile."""
+    """A moment without IMU or sticks once surfaced the robot 22 s later, with its pilot steering. Other fail-safes may warn meanwhile."""
     supervisor = supervisor_in(mode=Mode.ALT_HOLD)
     for tenth in range(300):
         health = (UPRIGHT._replace(**{figure: value}) if tenth < 3 else UPRIGHT)._replace(dead=(3,))

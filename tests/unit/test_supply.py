@@ -1,4 +1,4 @@
-"""The supply of each module, as the limiter is told of it: smoothed, and never what cannot be true."""
+"""The supply voltage of each module, as the limiter gets it: smoothed, and without implausible readings."""
 
 import math
 
@@ -14,7 +14,7 @@ NOMINAL_V = 12.0
 
 
 def meter() -> SupplyMeter:
-    """Of a body of modules 2 and 0 of a fleet of three."""
+    """A meter for a body of modules 2 and 0, of a fleet of three."""
     return SupplyMeter(assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2, [2, 0]))
 
 

@@ -1,4 +1,4 @@
-"""Whoever reads what the vehicle says may stand still or go away: no tick waits for him, and the process ends as it should."""
+"""A reader of the vehicle's messages may stall or go away: no tick waits for it, and the process ends in order."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ from firmware_py.runtime.teller import MOST_WAITING_LINES, Teller
 
 
 class Reader:
-    """Takes lines once it is let; tells when the first has come."""
+    """Sets `reached` when the first line has come; takes lines once `let` is set."""
 
     def __init__(self) -> None:
         self.lines: list[str] = []
@@ -57,7 +57,7 @@ def test_count_stands_where_the_lines_are_missing() -> None:
         said.say(str(number))
     again = threading.Event()
     reader.let.set()
-    said._queue.put("all read")  # a mark of the test's own
+    said._queue.put("all read")  # a marker of this test
     said._write = lambda line: again.set() if line == "all read" else reader.lines.append(line)
     assert again.wait(10)
     said.say("later")
@@ -95,7 +95,7 @@ def test_end_of_a_run_waits_a_second_at_the_most_for_a_reader_that_stalls(monkey
 
 
 def test_process_whose_pipe_is_full_ends_in_order() -> None:
-    """A thread that stands still in Python's own buffer makes the interpreter abort when it ends."""
+    """A thread blocked in Python's own output buffer makes the interpreter abort when it ends."""
     code = (
         "from firmware_py.runtime import teller; teller.CLOSE_S = 0.01; t = teller.Teller()\n"
         "for _ in range(900): t.say('x' * 1000)\n"
@@ -114,7 +114,7 @@ def test_lines_reach_standard_output(capfd: pytest.CaptureFixture[str]) -> None:
 
 
 def test_name_that_is_no_text_ends_nothing_that_is_said_after_it(capfd: pytest.CaptureFixture[str]) -> None:
-    """A folder's, as the system has it; such a line was the last."""
+    """A folder's name as the operating system returns it; such a line was once the last one said."""
     said, folder = Teller(), os.fsdecode(b"tank-\xe4")
     said.say(f"warning: no log: {folder}: No space left on device")
     said.say("armed")

@@ -1,4 +1,4 @@
-"""Thruster curves and the lag: a command makes the force that was wanted, one tick late and through the lag."""
+"""Thruster curves and lag: a command makes the wanted force, one tick late and through the lag."""
 
 import math
 from dataclasses import replace
@@ -36,7 +36,7 @@ def commands(thrusters: ThrusterSet, force: np.ndarray, scale: float = 1.0) -> n
 
 
 def force_of(thrusters: ThrusterSet, u: float) -> float:
-    """What the curve of the vehicle file gives, written out with numpy."""
+    """Force by the curve of the vehicle file, written out with numpy."""
     coefficients = thrusters.forward[0] if u >= 0 else thrusters.reverse[0]
     return float(np.copysign(np.polyval(np.r_[coefficients[::-1], 0.0], abs(u)), u))
 
@@ -123,7 +123,7 @@ def test_step_response_is_the_closed_form(thrusters: ThrusterSet) -> None:
 
 
 def test_impulse_of_any_command_sequence_is_kept(thrusters: ThrusterSet) -> None:
-    """The integral of a first-order lag's output is that of its input, less what it still holds."""
+    """The integral of a first-order lag's output is that of its input, less what the lag still holds."""
     lag = ThrusterLag(thrusters, DT)
     rng = np.random.default_rng(3)
     asked, given = np.zeros(8), np.zeros(8)

@@ -1,4 +1,4 @@
-"""The tools' command lines: --help says what they do and does nothing, and wrong arguments end with status 2 and no traceback."""
+"""The tools' command lines: --help describes the tool and starts nothing, and wrong arguments end with status 2 and no traceback."""
 
 import importlib
 import json
@@ -16,7 +16,7 @@ Run = Callable[..., int]
 
 @pytest.fixture
 def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Run]:
-    """run(tool, *arguments): its exit status, started in an empty folder; nothing that takes long begins."""
+    """run(tool, *arguments): runs a tool in an empty folder and returns its exit status; raises where long work would begin."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "1")
     before = set(sys.modules)

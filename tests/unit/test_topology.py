@@ -1,4 +1,4 @@
-"""Joining and parting of bodies: momentum, poses and disturbance are what they were, and parting undoes joining."""
+"""Joining and parting of bodies: momentum, poses and disturbance are preserved, and parting undoes joining."""
 
 import numpy as np
 import pytest
@@ -35,7 +35,7 @@ def module_pose(body: Body, x: np.ndarray, module: int) -> tuple[np.ndarray, Rot
 
 @pytest.fixture
 def two() -> tuple[Body, Body, Body, np.ndarray, np.ndarray]:
-    """A target, an active body against its +x face, the body they make, and a state of each."""
+    """A target, an active body against its +x face, the merged body, and the states of target and active body."""
     target, active = (assemble([(0, 0, 0)], [0], [VEHICLES[0]], [m]) for m in (0, 1))
     plan = plan_dock(DockRequest(1, 1, 0, 0, quarter_turns=1), active, target, VEHICLES)
     rng = np.random.default_rng(3)
@@ -89,17 +89,17 @@ def test_righting_moment_of_a_joined_body_is_the_sum_at_every_attitude(two: tupl
     target, active, merged, x_t, x_a = two
     joined = join([(target, Motion(x_t, np.eye(ERRORS), 10, 0)), (active, Motion(x_a, np.eye(ERRORS), 10, 0))], merged)
     vectors_w = [rotation(x[3:7]).apply(body.righting + x[26:29]) for body, x in ((target, x_t), (active, x_a))]
-    vectors_w += [-x[21] * (x[:3] - joined.x[:3]) for x in (x_t, x_a)]  # what lifts beside the middle
+    vectors_w += [-x[21] * (x[:3] - joined.x[:3]) for x in (x_t, x_a)]  # vertical forces off the centre of mass
     np.testing.assert_allclose(rotation(joined.x[3:7]).apply(merged.righting + joined.x[26:29]), sum(vectors_w), atol=1e-9)
 
 
 def test_moment_that_acts_is_known_after_a_dock_as_well_as_before(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
-    """Not how it shares out between disturbance and righting: by two modules' scale, and the righting of either is anybody's guess."""
+    """The acting moment alone, scaled by inertia: how it divides into disturbance and righting is unknown after the dock."""
     target, active, merged, x_t, x_a = two
-    x_t[3:7], x_a[3:7] = [1.0, 0.0, 0.0, 0.0], merged.q_bm[1]  # level: the righting turns it about x and y
+    x_t[3:7], x_a[3:7] = [1.0, 0.0, 0.0, 0.0], merged.q_bm[1]  # level: the righting moment acts about x and y
     acts = np.hstack([np.eye(3), [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]]])
     half = np.random.default_rng(1).normal(size=(6, 6))
-    half[:3] = half[:3] * 1e-3 - acts[:, 3:] @ half[3:]  # of the sum a thousandth, of either a lot
+    half[:3] = half[:3] * 1e-3 - acts[:, 3:] @ half[3:]  # the sum is known a thousand times better than either part
     at, covariance = np.r_[21:24, 25:28], np.eye(ERRORS)
     covariance[np.ix_(at, at)] = half @ half.T
     joined = join([(target, Motion(x_t, covariance, 10, 0)), (active, Motion(x_a, covariance, 10, 0))], merged)
@@ -157,10 +157,10 @@ def lattice(cells: list[tuple[int, ...]]) -> Body:
 @pytest.mark.parametrize(
     ("cells", "leaves", "way"),
     [
-        ([(x, y) for x in range(2) for y in range(2)], (1, 1), [0.5**0.5, 0.5**0.5, 0]),  # corner: across
+        ([(x, y) for x in range(2) for y in range(2)], (1, 1), [0.5**0.5, 0.5**0.5, 0]),  # corner: diagonally
         ([(x, y) for x in range(4) for y in range(3) if (x, y) not in ((1, 1), (2, 1))], (1, 0), [0, -1, 0]),  # between two of a ring
         ([(x, y) for x in range(3) for y in range(3)], (1, 1), [0, 0, 1]),  # middle of a plate: out of its plane
-        ([(1, 1), (0, 1), (0, 0), (1, 0), (2, 0), (3, 0), (3, 1), (3, 2), (2, 2)], (1, 1), [0, 1, 0]),  # corner, one stands across
+        ([(1, 1), (0, 1), (0, 0), (1, 0), (2, 0), (3, 0), (3, 1), (3, 2), (2, 2)], (1, 1), [0, 1, 0]),  # corner, (2, 2) blocks the diagonal
     ],
 )
 def test_module_leaves_a_lattice_by_a_way_that_no_neighbour_closes(
@@ -183,7 +183,7 @@ def test_module_that_its_neighbours_enclose_is_not_undocked() -> None:
 def test_biases_of_a_joined_body_are_the_mean_of_both_and_stay_with_their_modules_when_they_part(
     two: tuple[Body, Body, Body, np.ndarray, np.ndarray],
 ) -> None:
-    """The active module is turned a quarter against the target: its axes are others than the body's."""
+    """The active module is turned a quarter against the target, so its axes differ from the body's."""
     target, active, merged, x_t, x_a = two
     rng = np.random.default_rng(4)
     x_t[13:19], x_a[13:19], x_t[25], x_a[25] = rng.normal(size=6), rng.normal(size=6), 0.1, 0.3

@@ -1,4 +1,4 @@
-"""The supervisor's tables: what leads where, what each mode needs, and the numbers that logs hold."""
+"""The supervisor's tables: where each transition leads, what each mode needs, and the numbers stored in logs."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from firmware_py.core.types import Mode
 
 
 def test_numbers_are_those_of_the_logs() -> None:
-    """A log of last year must mean the same."""
+    """A log from last year must keep its meaning."""
     assert {state.name: int(state) for state in State} == {"DISARMED": 0, "ARMED": 1, "ESTOP": 2}
     assert [trigger.name for trigger in sorted(Trigger)] == [
         "ESTOP_FRAME", "ESTOP", "CLEAR_ESTOP", "DISARM", "ARM", "FORCED_ARM", "SET_MODE", "HOLD", "TRACK", "DOCK", "UNDOCK",

@@ -1,4 +1,4 @@
-"""The search for gains: what a trial costs, that it stops early what is worse, that it goes on where it was killed, and when it refuses."""
+"""The gain search: the cost of a trial, early end of worse trials, resuming after a kill, and refusals."""
 
 import itertools
 import json
@@ -39,7 +39,7 @@ START = Parameters().replace(BANDWIDTH, 7.5).replace(DAMPING, 1.0)
 
 @pytest.fixture
 def tools(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Any, Any]]:
-    """The modules tune_objective and tune_search; a flight takes no time and knows the best gains: 2 rad/s and 1."""
+    """The modules tune_objective and tune_search; simulated flights take no time and are best at gains of 2 rad/s and 1."""
     import tune_objective
     import tune_search
 
@@ -59,11 +59,11 @@ def objective_of(tools: tuple[Any, Any], folder: Path, text: str = OBJECTIVE) ->
 
 
 class PlugError(Exception):
-    """Somebody pulled the plug."""
+    """A simulated loss of power."""
 
 
 class Dying(Inline):
-    """Loses its power after so many flights."""
+    """An executor that loses its power after `flights` flights."""
 
     def __init__(self, flights: int) -> None:
         self.left = flights
@@ -245,7 +245,7 @@ def test_detuned_gains_are_off_by_up_to_three_and_within_the_bounds(tools: tuple
 
 @pytest.fixture
 def drawn(tools: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    """What tune_plots would save, with everything in its place."""
+    """The figures that tune_plots would save, laid out and drawn."""
     import matplotlib
     import tune_plots
 

@@ -1,4 +1,4 @@
-"""Undocks as people ask for them: twice, under way, ended, and across a ring."""
+"""Undocks on request: two at once, one under way, ended ones, and corners of a ring."""
 
 from dataclasses import replace
 
@@ -51,7 +51,7 @@ def test_undock_under_way_goes_on_when_what_is_asked_for_meanwhile_is_refused(bo
 
 @pytest.mark.parametrize(("ahead", "behind", "glides"), [(False, False, 1), (True, False, 0), (False, True, 1), (True, True, None)])
 def test_what_is_undocked_glides_to_no_third_body(ahead: bool, behind: bool, glides: int | None) -> None:
-    """A chain of three was taken apart: the middle one, sent away from the last, went to stand against the first, and they pressed."""
+    """When a chain of three was taken apart, the middle one once glided away from the last and pressed against the first."""
     tank = Docked([(0, 0, 0), (1, 0, 0)] * 3, each=2)
     standoff_m = Parameters().docking.standoff_m
     along_w = world(tank.states[0]).apply([2.0 * PITCH_M + standoff_m, 0.0, 0.0])
@@ -84,7 +84,7 @@ def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> 
 
 @pytest.mark.parametrize("hung", [{2, 3}, {1, 3}, {2}, {3}], ids=str)
 def test_corner_of_a_ring_stays_where_the_relays_of_a_joint_hang(hung: set[int]) -> None:
-    """Funnels hold back what leaves across, so no picture tells; the currents of a joint that is held do not turn."""
+    """Funnels hold back a module that leaves diagonally, so pictures prove nothing; but currents of a held joint do not change sign."""
     tank = Docked(RING)
     tank.fly()
     tank.hung, tank.stuck = hung, True
@@ -99,7 +99,7 @@ def test_corner_of_a_ring_stays_where_the_relays_of_a_joint_hang(hung: set[int])
 
 
 def test_corner_of_a_ring_whose_hanging_relays_have_nothing_before_them_any_more_is_undocked() -> None:
-    """Their currents have not turned, and are those of idle coils; so are the others', which is to bother nobody here."""
+    """Their currents keep their sign but are as low as those of idle coils. So are all others, hence the fail-safe is switched off."""
     tank = Docked(RING, Parameters().replace("failsafes.partner_lost_action", 0))
     tank.fly()
     tank.hung, tank.stuck, tank.pull_ma = {2, 3}, True, 40.0
@@ -129,7 +129,7 @@ def test_push_shorter_than_currents_need_tells_a_corner_that_leaves_from_one_tha
 
 @pytest.mark.parametrize("stuck", [False, True])
 def test_push_shorter_than_pictures_need_tells_a_module_that_leaves_from_one_that_is_jammed(stuck: bool) -> None:
-    """Of one joint a picture tells more than currents, and is waited for: what is jammed stays where it is though both magnets push."""
+    """For a single joint, a picture proves more than currents and is waited for: a jammed module stays although both magnets push."""
     tank = Docked(RING[:2], Parameters().replace("docking.release_s", 0.01))
     tank.fly()
     tank.stuck = stuck
@@ -164,7 +164,7 @@ def test_magnets_that_push_one_body_apart_push_on_while_another_parts() -> None:
 
 
 def test_two_corners_of_a_ring_undocked_at_once_leave_no_magnet_on_between_them() -> None:
-    """The second undock is ended by the first, which has undone one of its two joints: that one would pull the leaving module back."""
+    """The first undock ends the second, having opened one of its two joints: magnets left on there would pull module 3 back."""
     tank = Docked(RING)
     tank.fly()
     tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)), Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))

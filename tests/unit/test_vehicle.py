@@ -1,4 +1,4 @@
-"""Vehicle files: thrusters as published, turned from FLU into FRD where the source is FLU; tags on their faces."""
+"""Vehicle files: thrusters as published, converted from FLU to FRD where the source is FLU; tags on their faces."""
 
 import dataclasses
 import itertools
@@ -104,7 +104,7 @@ SINGULAR = {
     "modcube": [2.0012, 1.4142, 1.4142, 0.1714, 0.14, 0.07],
     "modcube_sim": [2.0, 1.4142, 1.4142, 0.2335, 0.1715, 0.1187],
 }
-"""The errata's, calculated apart from this code."""
+"""Singular values of the errata, calculated independently of this code."""
 
 
 @pytest.mark.parametrize("name", MODULES)
@@ -122,7 +122,7 @@ def test_rank_tells_which_vehicles_leave_a_freedom_to_buoyancy(name: str) -> Non
 
 
 def largest_moment(vehicle: Vehicle, direction: np.ndarray) -> float:
-    """N m about `direction` without any force, within the limits of the thrusters."""
+    """Largest moment about `direction` at zero force, within the limits of the thrusters, N m."""
     n = len(vehicle.thruster)
     rows = np.c_[wrench_matrix(vehicle), -np.r_[np.zeros(3), direction]]
     bounds = [(vehicle.force_min_n, vehicle.force_max_n)] * n + [(0, None)]
@@ -205,7 +205,7 @@ def test_drag_along_the_diagonal_follows_from_face_and_edge() -> None:
 
 
 def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
-    """The module's file with one thing changed."""
+    """A copy of modcube.toml with `old` replaced by `new`."""
     text = (resources.files("firmware_py") / "vehicles" / "modcube.toml").read_text()
     assert old in text
     path = folder / "odd.toml"

@@ -1,4 +1,4 @@
-"""Where the vehicle's process logs: beside the logs of those before it, and without one where the disk takes none."""
+"""Where the vehicle's process logs: beside the logs of earlier processes, and nowhere if the disk takes no folder."""
 
 import errno
 import os
@@ -20,7 +20,7 @@ from tests.unit.vehicle_runs import LOGS, content, fly
 
 
 def test_process_that_is_refused_a_folder_leaves_the_log_of_who_has_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two that start at once, both before either has a log there."""
+    """Two processes start at once, both before either has a log there."""
     monkeypatch.setattr(vehicle, "make_log_folder", lambda out: out)
     note = EstopNote(tmp_path)
     log = Recorder(tmp_path, {})
@@ -63,7 +63,7 @@ def test_folder_without_a_log_takes_the_first(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_start_that_failed_leaves_no_log_behind(tmp_path: Path) -> None:
-    """A service that waits for its bus would fill the disk, and the log of the crash would not be the newest."""
+    """A service that is restarted until its bus exists would fill the disk, and the log of the crash would not be the newest."""
     fly(tmp_path, tmp_path / "log")
     before = content(tmp_path / "log")
     for out in (tmp_path / "log", tmp_path):
@@ -93,4 +93,4 @@ def test_file_in_place_of_the_folder_is_refused(tmp_path: Path) -> None:
     for out in (tmp_path / "taken", tmp_path / "taken" / "log"):
         with pytest.raises(OSError, match="taken") as refused:
             fly(tmp_path, out)
-        assert refused.value.filename is not None  # the command line makes one line and status 2 of it
+        assert refused.value.filename is not None  # the command line turns it into one line and status 2

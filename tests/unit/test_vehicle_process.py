@@ -1,4 +1,4 @@
-"""The vehicle's process on a bus where nobody answers: what it says, how it starts and ends."""
+"""The vehicle's process on a bus where no module answers: what it says, how it starts and ends."""
 
 import errno
 import os
@@ -63,7 +63,7 @@ def test_vehicle_that_is_told_to_ignore_the_end_of_its_terminal_does() -> None:
 
 @pytest.mark.parametrize(("name", "told"), [("girona500", 1), ("modcube", 0)])
 def test_robot_that_carries_no_tag_is_told_so_at_its_start(name: str, told: int, tmp_path: Path) -> None:
-    """By a camera it is never seen; it would wait for its place for ever."""
+    """No camera can see it, so it would wait for its pose forever."""
     said = fly(tmp_path, fleet=single(name, bus_of(tmp_path)), hold=True)
     assert sum(line.startswith("warning: module 1 carries no [[tag]]: ") for line in said) == told
 
@@ -104,7 +104,7 @@ def test_flight_goes_on_when_nobody_reads_its_lines_any_more(tmp_path: Path) -> 
         raise BrokenPipeError(errno.EPIPE, "Broken pipe")
 
     assert fly(tmp_path, tmp_path / "log", hang_up)[-1].startswith("running at")
-    assert len(list(FlightLog(tmp_path / "log").ticks())) >= 10  # the farewell
+    assert len(list(FlightLog(tmp_path / "log").ticks())) >= 10  # FAREWELL_TICKS
 
 
 @pytest.mark.slow
@@ -129,7 +129,7 @@ def test_libraries_are_read_when_all_is_composed_and_before_the_first_tick(tmp_p
 
 
 class Tape(Recorder):
-    """A recorder that only counts when it hands over what it has."""
+    """A recorder that only notes the ticks in which it is flushed."""
 
     def __init__(self) -> None:
         self.flushed: list[int] = []
@@ -147,7 +147,7 @@ class Tape(Recorder):
 
 
 def test_log_says_at_once_who_is_armed() -> None:
-    """A process that is killed just after a DISARM must not take it for a flight."""
+    """The log of a process that is killed just after a DISARM must not count as one of a flight."""
     tape = Tape()
     observe = recording(tape, 100)
     armed: Sequence[bool] = [20 < tick <= 33 for tick in range(120)]

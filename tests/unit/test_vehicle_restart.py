@@ -1,4 +1,4 @@
-"""A vehicle's process that was killed in flight holds again, and arms nobody as a body that may be none any more."""
+"""A vehicle's process that was killed in flight holds again, but arms no body whose joints may have changed."""
 
 import dataclasses
 from pathlib import Path
@@ -21,7 +21,7 @@ HOLDS = "the process before ended in flight: holding as soon as the vehicle may 
 
 
 def in_flight(tmp_path: Path, more: str = "", modules: tuple[Module, ...] = FLEET.module) -> Fleet:
-    """Leaves the log of a process that was killed in flight just now."""
+    """Writes the log of a process that was killed in flight just now; returns the fleet."""
     tmp_path.joinpath("log").mkdir()
     Recorder(tmp_path / "log", {"boot": boot_id()}).close()
     tmp_path.joinpath("log", CAN_LOG).write_text(lines_of([True] * 3) + more)
@@ -65,7 +65,7 @@ def test_modules_that_docked_in_flight_are_named_and_not_armed_again(tmp_path: P
     said = fly(tmp_path, tmp_path / "log", parameters=parameters, fleet=in_flight(tmp_path, PAIR))
     assert said[0] == APART.format(bus=bus_of(tmp_path))
     assert HOLDS not in said
-    assert any(line.startswith("running at") for line in said)  # the start refuses nothing
+    assert any(line.startswith("running at") for line in said)  # the start is not refused
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ Told = tuple[State, list[Request]]
 
 
 def stopped(folder: Path, *told: Told, before: bool = False) -> None:
-    """The log of a process whose one body was in such states, each in a tick in which so much was asked for, and which then was killed."""
+    """Writes the log of a process that was then killed. `told`: its body's state and the requests, per tick; `before`: an e-stop stood."""
     log = make_log_folder(folder)
     recorder = Recorder(log, {})
     note = EstopNote(folder)
@@ -86,7 +86,7 @@ def test_order_to_hold_arms_nobody_after_a_stop_that_was_not_cleared(tmp_path: P
 def test_stop_outlives_every_restart_until_a_person_clears_it_or_arms(tmp_path: Path, told: Told, stands: bool) -> None:
     stopped(tmp_path, (State.ESTOP, []))
     stopped(tmp_path, (State.DISARMED, []), told, (State.DISARMED, []), before=True)
-    make_log_folder(tmp_path)  # of a process that came to no tick
+    make_log_folder(tmp_path)  # of a process that ran no tick
     assert last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped == stands
 
 

@@ -1,4 +1,4 @@
-"""What waits beside the loop: one job for each wish, the urgent first, and the same ones in a replay."""
+"""Jobs that wait beside the loop: at most one per wish, urgent ones first, and the same ones in a replay."""
 
 import threading
 from collections.abc import Iterator
@@ -16,7 +16,7 @@ from firmware_py.runtime.worker import InlineWorker, Job, ThreadWorker, Worker
 
 
 class Slow(Worker):
-    """Its job is done when the test says so."""
+    """A worker whose job is done when the test says so."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -31,13 +31,13 @@ class Slow(Worker):
         return [self.begun[-1]()] if done else []
 
     def finish(self) -> list[Any]:
-        """What comes of the job that was begun."""
+        """Finishes the job that was begun; returns its results."""
         self.is_done = True
         return self.results()
 
 
 def submit(worker: Worker, *names: str) -> None:
-    """Jobs whose results are their names. The letters are their wish; `!`: it goes first."""
+    """Submits jobs whose results are their names. The letters of a name are the wish; a final `!` makes the job go first."""
     for name in names:
         worker.submit(lambda name=name: name, name.rstrip("!0123456789"), first=name.endswith("!"))  # type: ignore[misc]
 
@@ -80,7 +80,7 @@ def test_jobs_beside_the_loop_that_pile_up_are_dropped_but_for_the_newest(thread
 
 
 def test_replay_does_the_jobs_that_were_done_in_flight() -> None:
-    """The log says how many results each tick took, and nothing of which jobs they were."""
+    """The log holds the number of results that each tick took, but not which jobs they came from."""
     asked = [["dock1", "dock2"], ["dock3", "other1"], ["other2"], ["part1!", "dock4"], [], [], [], []]
     finished = [False, False, True, False, True, True, True, True]
     flown, again = Slow(), DueWorker()
@@ -103,7 +103,7 @@ def trio() -> Firmware:
 
 
 def step(firmware: Firmware, *requests: DockRequest | PartRequest) -> None:
-    """A tick in which the pipeline wants this prepared."""
+    """Runs a tick in which the pipeline asks for these preparations."""
     outputs = Outputs(1, 0, [], False, [], [], preparations=list(requests))
     firmware.pipeline.step = lambda inputs: outputs  # type: ignore[method-assign]
     firmware.tick(Inputs(1, 0, [ModuleInputs()] * 3))

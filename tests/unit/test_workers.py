@@ -15,7 +15,7 @@ from tests.unit.campaigns import Inline, PlugError, content, fly, flying
 
 
 def dying(after: int) -> Pool:
-    """Executors whose worker dies after so many trials."""
+    """Executors whose worker dies after `after` trials."""
 
     class Dying(Inline):
         left = after
@@ -95,7 +95,7 @@ def test_few_trials_are_under_way_after_a_death(tmp_path: Path, monkeypatch: pyt
 
 
 def ending(end: Callable[[Future[Any]], object]) -> Pool:
-    """An executor in which seed 2 ends otherwise, and then ones that do all."""
+    """First an executor in which seed 2 ends by `end`, then executors that complete every trial."""
 
     class Ending(Inline):
         def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -115,7 +115,7 @@ def killed_on_dask(future: Future[Any]) -> None:
 
 
 def cancelled_on_dask(future: Future[Any]) -> None:
-    """As everything is when the scheduler is gone."""
+    """As every future is when the scheduler is gone."""
     future.cancel()
     future.set_running_or_notify_cancel()
 

@@ -1,4 +1,4 @@
-"""A run of the vehicle's process on a bus where nobody answers, and what it leaves in its folder."""
+"""Runs of the vehicle's process on a bus where no module answers, and the files that they leave."""
 
 import os
 import signal
@@ -14,7 +14,7 @@ LOGS = (CAN_LOG, SIGNAL_LOG)
 
 
 def bus_of(path: Path) -> str:
-    """A bus of this test's own."""
+    """Address of a bus that only this test uses."""
     return f"virtual:{path.name}"
 
 
@@ -22,7 +22,7 @@ def fly(
     tmp_path: Path, out: Path | None = None, then: Callable[[], None] = lambda: None, parameters: Parameters | None = None,
     fleet: Fleet | None = None, hold: bool = False, ending: signal.Signals = signal.SIGTERM,
 ) -> list[str]:  # fmt: skip
-    """Starts, and asks for the end in the first tick. `then` is done by whoever says so. Returns what was said."""
+    """Runs the process and signals its end as soon as it says that it runs; `then` runs in the thread that says so. Returns the lines."""
     said: list[str] = []
 
     def say(line: str) -> None:

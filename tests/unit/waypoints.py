@@ -1,4 +1,4 @@
-"""Waypoints drawn at random for tests of minimum snap, and the extremes of what was planned through them."""
+"""Random waypoints for tests of minimum snap, and the extremes of the planned trajectories."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
