@@ -35,47 +35,50 @@ BUS, VEHICLE, RATE_HZ = "socketcan:can0", "modcube", 100
 _STDERR = 2
 LIVE_HOST, LIVE_PORT = "127.0.0.1", 8765
 """Default address of the live view."""
-Log = Annotated[Path, typer.Argument(parser=folder_of, help="folder that a run left: can.log and signals.mcap")]
+Log = Annotated[Path, typer.Argument(parser=folder_of, help="folder of a run, with can.log and signals.mcap")]
 
 app = typer.Typer(
     help="Controller of a self-reconfigurable underwater robot.", no_args_is_help=True, pretty_exceptions_enable=False
 )
 
 
-log_app = typer.Typer(help="Logs that runs left.", no_args_is_help=True)
+log_app = typer.Typer(help="Work with the logs of earlier runs.", no_args_is_help=True)
 app.add_typer(log_app, name="log")
 
 
 @app.command()
 def run(
     bus: Annotated[
-        str | None, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE", show_default=BUS)
+        str | None, typer.Option(help="CAN bus: virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE", show_default=BUS)
     ] = None,
     fleet: Annotated[
-        Path | None, typer.Option(help="fleet file: buses, rate and modules, so not beside --bus, --rate, --vehicle; without it module 1")
+        Path | None, typer.Option(help="fleet file: buses, rate, modules; not with --bus, --rate, --vehicle; without it: module 1")
     ] = None,
-    vehicle: Annotated[str | None, typer.Option(help="vehicle of the one module", show_default=VEHICLE)] = None,
-    parameters: Annotated[Path | None, typer.Option(help="file of parameters")] = None,
-    rate_hz: Annotated[int | None, typer.Option("--rate", min=50, max=400, help="ticks a second", show_default=f"{RATE_HZ}")] = None,
-    hold: Annotated[bool, typer.Option("--hold", help="arm as soon as the vehicle may, and hold the place")] = False,
+    vehicle: Annotated[str | None, typer.Option(help="vehicle name or file of the single module", show_default=VEHICLE)] = None,
+    parameters: Annotated[Path | None, typer.Option(help="parameter file")] = None,
+    rate_hz: Annotated[int | None, typer.Option("--rate", min=50, max=400, help="tick rate, Hz", show_default=f"{RATE_HZ}")] = None,
+    hold: Annotated[bool, typer.Option("--hold", help="arm as soon as permitted, and hold position")] = False,
     out: Annotated[
-        Path | None, typer.Option(parser=folder_of, metavar="DIR", help="folder for the logs; where it holds one, 0002, 0003, ... in it")
+        Path | None,
+        typer.Option(parser=folder_of, metavar="DIR", help="folder for the logs; if it holds one already, subfolder 0002, 0003, ..."),
     ] = None,
     ground: Annotated[
         list[str] | None, typer.Option(help="link to ground stations: udpout:, udpin:, tcpin:HOST:PORT, /dev/NAME,BAUD")
     ] = None,
-    identity: Annotated[str | None, typer.Option(help="generic (PX4's modes) or ardusub", show_default="generic")] = None,
+    identity: Annotated[
+        str | None, typer.Option(help="modes shown to ground stations: generic (PX4's) or ardusub", show_default="generic")
+    ] = None,
     store: Annotated[str | None, typer.Option(help="folder for parameters and signing key of ground stations")] = None,
     ground_file: Annotated[
         Path | None,
         typer.Option(
-            help="file of the ground side: links, identity, store, whom it watches, dock buttons; --ground, --identity, --store go first"
+            help="ground station file: links, identity, store, watched station, dock buttons; --ground, --identity, --store override it"
         ),
     ] = None,
-    stats: Annotated[bool, typer.Option("--stats", help="print how the ticks kept their deadlines")] = False,
+    stats: Annotated[bool, typer.Option("--stats", help="print statistics of tick deadlines")] = False,
     live: Annotated[bool, typer.Option("--live", help="serve a live view for Foxglove")] = False,
-    live_host: Annotated[str | None, typer.Option(help="address that the live view listens on", show_default=LIVE_HOST)] = None,
-    live_port: Annotated[int | None, typer.Option(min=1, max=65535, help="and its port", show_default=f"{LIVE_PORT}")] = None,
+    live_host: Annotated[str | None, typer.Option(help="address of the live view", show_default=LIVE_HOST)] = None,
+    live_port: Annotated[int | None, typer.Option(min=1, max=65535, help="port of the live view", show_default=f"{LIVE_PORT}")] = None,
 ) -> None:
     """Run the vehicle until SIGINT, SIGTERM or SIGHUP."""
     from firmware_py.app.deadlines import stats_lines
@@ -141,11 +144,11 @@ def ground_config(
 @app.command()
 def doctor(
     bus: Annotated[
-        str | None, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE", show_default=BUS)
+        str | None, typer.Option(help="CAN bus: virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE", show_default=BUS)
     ] = None,
-    fleet: Annotated[Path | None, typer.Option(help="fleet file, not beside --bus; without it module 1")] = None,
-    out: Annotated[Path, typer.Option(parser=folder_of, metavar="DIR", help="folder for logs")] = Path(),
-    warm: Annotated[bool, typer.Option("--warm", help="only compile what a tick calls, into the cache")] = False,
+    fleet: Annotated[Path | None, typer.Option(help="fleet file; not with --bus; without it: module 1")] = None,
+    out: Annotated[Path, typer.Option(parser=folder_of, metavar="DIR", help="folder for the logs")] = Path(),
+    warm: Annotated[bool, typer.Option("--warm", help="only compile the functions that a tick calls into the cache")] = False,
 ) -> None:
     """Say whether this machine and its buses are fit to fly."""
     from firmware_py.app.doctor import warm_up
@@ -160,8 +163,8 @@ def doctor(
 
 @app.command()
 def parameters(
-    group: Annotated[list[str] | None, typer.Argument(help="groups to print; without any all of them")] = None,
-    file: Annotated[Path | None, typer.Option("--parameters", help="values of this file in place of the shipped ones")] = None,
+    group: Annotated[list[str] | None, typer.Argument(help="groups to print; all if none is given")] = None,
+    file: Annotated[Path | None, typer.Option("--parameters", help="parameter file to print in place of the shipped values")] = None,
 ) -> None:
     """Print the parameters as a file for --parameters: each with its value, what is permitted, what it does, its name on MAVLink."""
     chosen = load_parameters(file) if file is not None else Parameters()
@@ -174,7 +177,7 @@ def parameters(
 
 @app.command()
 def vehicle(
-    name: Annotated[str | None, typer.Argument(help="one that comes with modcube, or a file; without one their names are printed")] = None,
+    name: Annotated[str | None, typer.Argument(help="name of a shipped vehicle, or a vehicle file; default: list the names")] = None,
 ) -> None:
     """Print what the controller believes about a vehicle as a file for --vehicle: each value with its unit, range and meaning."""
     typer.echo("\n".join(vehicle_names()) if name is None else to_toml(load_vehicle(name), explained).rstrip())
@@ -184,7 +187,7 @@ def vehicle(
 def replay(
     log: Log,
     tolerance: Annotated[
-        float, typer.Option(min=0.0, max=1.0, help="share by which numbers may differ: for logs of another machine; 0: every byte")
+        float, typer.Option(min=0.0, max=1.0, help="largest relative difference of numbers, for logs of another machine; 0: exact bytes")
     ] = 0.0,
 ) -> None:
     """Feed a recorded flight to the same code again and compare every byte that comes out; status 1 when one differs."""
@@ -195,7 +198,7 @@ def replay(
 
 @app.command("clear-estop")
 def clear_estop(
-    out: Annotated[Path, typer.Argument(parser=folder_of, help="folder for the logs, as `modcube run --out` has it")],
+    out: Annotated[Path, typer.Argument(parser=folder_of, help="folder for the logs, as given to `modcube run --out`")],
 ) -> None:
     """Clear the e-stop in which the last flight ended, where no ground station does: the next start may arm by itself again.
 

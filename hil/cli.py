@@ -26,10 +26,10 @@ FAILED = 1
 RATES_HZ = tuple(rate for rate in range(50, 401) if 1_000_000_000 % (rate * STEP_NS) == 0)
 """Tick rates whose period is a whole number of the plant's sub-steps."""
 
-ScenarioName = Annotated[str, typer.Argument(help="name of a scenario (`modcube hil list`), or a .toml file")]
-Controller = Annotated[str, typer.Option(help="modcube, least_power, paper, paper_sequence, or a file of parameters")]
-Vehicle = Annotated[str, typer.Option(help="vehicle in place of the scenario's")]
-Sensors = Annotated[str, typer.Option(help="real, or ideal: no noise, no delay")]
+ScenarioName = Annotated[str, typer.Argument(help="scenario name (see `modcube hil list`), or .toml file")]
+Controller = Annotated[str, typer.Option(help="modcube, least_power, paper, paper_sequence, or a parameter file")]
+Vehicle = Annotated[str, typer.Option(help="vehicle name or file, in place of the vehicles of the scenario")]
+Sensors = Annotated[str, typer.Option(help="real, or ideal: without noise and delay")]
 
 
 def parameters_of(controller: str) -> Parameters:
@@ -75,18 +75,18 @@ def unusual_in(vehicle: str, controller: str, sensors: str) -> list[str]:
 @app.command()
 def run(
     scenario: ScenarioName,
-    seed: Annotated[int, typer.Option(min=0, help="of the world's every draw")] = 0,
-    bus: Annotated[str, typer.Option(help="virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE")] = DEFAULT_BUS,
+    seed: Annotated[int, typer.Option(min=0, help="seed of all random draws of the world")] = 0,
+    bus: Annotated[str, typer.Option(help="CAN bus: virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE")] = DEFAULT_BUS,
     out: Annotated[
         Path | None,
-        typer.Option(parser=folder_of, metavar="DIR", help="folder for logs, plots and report; only an earlier flight is replaced"),
+        typer.Option(parser=folder_of, metavar="DIR", help="folder for logs, plots and report; replaces only an earlier flight"),
     ] = None,
     controller: Controller = "modcube",
     vehicle: Vehicle = "",
     sensors: Sensors = "real",
-    plots: Annotated[bool, typer.Option(help="draw plots and report")] = True,
-    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="ticks a second")] = 100,
-    realtime: Annotated[bool, typer.Option("--realtime", help="two processes, each on its own clock")] = False,
+    plots: Annotated[bool, typer.Option(help="draw plots and write the report")] = True,
+    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="tick rate, Hz")] = 100,
+    realtime: Annotated[bool, typer.Option("--realtime", help="run firmware and plant as two processes, each on its own clock")] = False,
 ) -> None:
     """Fly one scenario; prints a table and leaves logs, plots, report.html and result.json."""
     with ended_at_once():
@@ -130,17 +130,19 @@ def campaign(
     context: typer.Context,
     scenario: ScenarioName,
     trials: Annotated[int, typer.Option(min=1, help="number of seeds")] = 20,
-    jobs: Annotated[int, typer.Option(min=1, help="processes")] = 2,
-    dask: Annotated[str, typer.Option(metavar="ADDRESS", help="scheduler of a dask cluster, tcp://HOST:PORT, in place of processes")] = "",
+    jobs: Annotated[int, typer.Option(min=1, help="number of parallel processes")] = 2,
+    dask: Annotated[
+        str, typer.Option(metavar="ADDRESS", help="scheduler of a dask cluster, tcp://HOST:PORT, in place of local processes")
+    ] = "",
     seed: Annotated[int, typer.Option(min=0, help="first seed")] = 0,
     out: Annotated[
         Path | None,
-        typer.Option(parser=folder_of, metavar="DIR", help="folder for trials.jsonl, trials.csv, campaign.json; a campaign in it goes on"),
+        typer.Option(parser=folder_of, metavar="DIR", help="folder for trials.jsonl, trials.csv, campaign.json; resumes a campaign in it"),
     ] = None,
     controller: Controller = "modcube",
     vehicle: Vehicle = "",
     sensors: Sensors = "real",
-    draw: Annotated[int, typer.Option(min=0, max=5, help="so many of the worst seeds are flown again for logs, plots and report")] = 1,
+    draw: Annotated[int, typer.Option(min=0, max=5, help="number of worst seeds that are flown again for logs, plots and report")] = 1,
 ) -> None:
     """Fly many seeds of a scenario; prints a table and keeps every trial. Started again after an interruption, it resumes.
 
@@ -209,10 +211,10 @@ def _fly_faults(jobs: int, seed: int, out: Path | None) -> int:
 @app.command()
 def plant(
     scenario: ScenarioName,
-    bus: Annotated[str, typer.Option(help="udp:GROUP:PORT or socketcan:IFACE")],
-    seed: Annotated[int, typer.Option(min=0, help="of the world's every draw")] = 0,
-    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="ticks a second of the firmware")] = 100,
-    out: Annotated[Path | None, typer.Option(parser=folder_of, metavar="DIR", help="folder for the truth's log")] = None,
+    bus: Annotated[str, typer.Option(help="CAN bus: udp:GROUP:PORT or socketcan:IFACE")],
+    seed: Annotated[int, typer.Option(min=0, help="seed of all random draws of the world")] = 0,
+    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="tick rate of the firmware, Hz")] = 100,
+    out: Annotated[Path | None, typer.Option(parser=folder_of, metavar="DIR", help="folder for the log of the true motion")] = None,
 ) -> None:
     """Run the simulated plant alone, in real time, until SIGINT or SIGTERM: the other end of `modcube run`."""
     from hil.plant_process import serve_until_signal

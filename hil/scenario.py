@@ -31,19 +31,19 @@ class ModuleStart:
     """One module: its vehicle and its initial pose."""
 
     number: int = quantity(low=1, high=29, help="number on the bus")
-    vehicle: str = quantity("modcube", help="vehicle name, or a file beside the scenario's")
+    vehicle: str = quantity("modcube", help="vehicle name, or vehicle file beside the scenario file")
     position_m: np.ndarray = quantity(
         [0, 0, 0], unit="m", low=-1000, high=1000, shape=(3,),
-        help="world; a lone module: its hull's centre; docked ones: their centre of mass, given with the first",
+        help="world position of the hull centre of a lone module; of docked modules: centre of mass, given with the first",
     )  # fmt: skip
     euler_deg: np.ndarray = quantity(
-        [0, 0, 0], unit="deg", low=-360, high=360, shape=(3,), help="roll, pitch, yaw of the body, given with the first"
+        [0, 0, 0], unit="deg", low=-360, high=360, shape=(3,), help="roll, pitch, yaw of the body, given with its first module"
     )
-    body: int = quantity(-1, low=-1, high=63, help="modules with the same number start docked; -1: alone")
-    cell: np.ndarray = quantity([0, 0, 0], unit="lattice", low=-64, high=64, shape=(3,), help="place in its body")
-    rotation: int = quantity(0, low=0, high=23, help="which of the 24 rotations of the cube it has in its body")
+    body: int = quantity(-1, low=-1, high=63, help="number shared by modules that start docked together; -1: alone")
+    cell: np.ndarray = quantity([0, 0, 0], unit="lattice", low=-64, high=64, shape=(3,), help="lattice cell of the module in its body")
+    rotation: int = quantity(0, low=0, high=23, help="index of the module's rotation in its body, one of the 24 rotations of the cube")
 
-    clamped: bool = quantity(False, help="a load cell holds its body")
+    clamped: bool = quantity(False, help="whether a load cell holds the module's body in place")
 
     def __post_init__(self) -> None:
         check_cell(self.cell)
@@ -58,8 +58,8 @@ class ModuleStart:
 class RandomStart:
     """Random offset of every body's initial pose, drawn per seed, uniform within these bounds."""
 
-    position_m: np.ndarray = quantity([0, 0, 0], unit="m", low=0, high=100, shape=(3,), help="along each world axis")
-    yaw_deg: float = quantity(0.0, unit="deg", low=0, high=180, help="about the vertical")
+    position_m: np.ndarray = quantity([0, 0, 0], unit="m", low=0, high=100, shape=(3,), help="largest random offset along each world axis")
+    yaw_deg: float = quantity(0.0, unit="deg", low=0, high=180, help="largest random turn about the vertical")
 
     def shifted(self, start: Start, seed: int, leader: int) -> Start:
         """Returns the initial pose of the body led by the module with index `leader`, in the run `seed`."""
@@ -74,17 +74,17 @@ class Step:
 
     do: str = quantity(
         choices=("dock", "undock", "move", "moebius", "wait"),
-        help="dock, undock: the faces named here; move: the body of `module` to a place; moebius: it flies the strip",
+        help="dock, undock: the named faces; move: the body of `module` to position_m; moebius: the body of `module` along the strip",
     )
     module: int = quantity(2, low=1, high=29, help="number of the active module")
-    face: str = quantity("-x", choices=FACE_NAMES, help="its face")
-    target_module: int = quantity(1, low=1, high=29, help="number of the other module")
-    target_face: str = quantity("+x", choices=FACE_NAMES, help="its face")
-    quarter_turns: int = quantity(0, low=0, high=3, help="of the active face about its normal")
-    both_approach: bool = quantity(False, help="both bodies move, as in the paper")
-    position_m: np.ndarray = quantity([0, 0, 0], unit="m", low=-100, high=100, shape=(3,), help="move: where to, world")
-    duration_s: float = quantity(10.0, unit="s", low=0, high=3600, help="move, moebius, wait: how long")
-    also: bool = quantity(False, help="begins together with the step before")
+    face: str = quantity("-x", choices=FACE_NAMES, help="face of the active module")
+    target_module: int = quantity(1, low=1, high=29, help="number of the target module")
+    target_face: str = quantity("+x", choices=FACE_NAMES, help="face of the target module")
+    quarter_turns: int = quantity(0, low=0, high=3, help="quarter turns of the active face about its normal")
+    both_approach: bool = quantity(False, help="whether both bodies move towards each other, as in the paper")
+    position_m: np.ndarray = quantity([0, 0, 0], unit="m", low=-100, high=100, shape=(3,), help="move: target position, world")
+    duration_s: float = quantity(10.0, unit="s", low=0, high=3600, help="move, moebius, wait: duration of the step")
+    also: bool = quantity(False, help="whether the step begins together with the previous one")
 
     def __post_init__(self) -> None:
         if self.do in ("dock", "undock") and self.module == self.target_module:
@@ -106,33 +106,35 @@ class Task:
 
     kind: str = quantity(
         choices=("hover", "spiral", "moebius", "lissajous", "waypoints", "dock", "force", "mode"),
-        help="hover: hold the place; spiral: climb on a cylinder; moebius: along the rim of a Moebius strip; "
-        "lissajous: centre + amplitude sin(frequency u), u from 0 to 2 pi turns; waypoints: through those in `file`; "
-        "dock: the [[step]]s; force: a stick on a load cell; mode: stays in `mode`",
+        help="hover: hold the position; spiral: climb on a cylinder; moebius: along the rim of a Moebius strip; "
+        "lissajous: centre + amplitude sin(frequency u), u from 0 to 2 pi turns; waypoints: along those in `file`; "
+        "dock: the [[step]]s; force: a stick with the robot on a load cell; mode: stay in `mode`",
     )
-    mode: str = quantity("POSHOLD", choices=MODES, help="mode: which one")
-    pilot_until_s: float = quantity(1e6, unit="s", low=0, high=1e6, help="mode: sticks and set-points stream so long")
-    ground_until_s: float = quantity(0.0, unit="s", low=0, high=1e6, help="mode: a ground station is heard so long; 0: never")
-    settle_s: float = quantity(15.0, unit="s", low=0, high=600, help="held at the start before the task begins")
-    duration_s: float = quantity(unit="s", low=0.1, high=7200, help="of the task itself, rest to rest")
-    radius_m: float = quantity(0.30, unit="m", low=0.01, high=100, help="spiral: radius; moebius: of the centre circle")
+    mode: str = quantity("POSHOLD", choices=MODES, help="mode: the mode to stay in")
+    pilot_until_s: float = quantity(1e6, unit="s", low=0, high=1e6, help="mode: time of the run until which sticks and set-points stream")
+    ground_until_s: float = quantity(
+        0.0, unit="s", low=0, high=1e6, help="mode: time of the run until which a ground station is heard; 0: never"
+    )
+    settle_s: float = quantity(15.0, unit="s", low=0, high=600, help="time that the robot holds its start before the task begins")
+    duration_s: float = quantity(unit="s", low=0.1, high=7200, help="duration of the task itself, from rest to rest")
+    radius_m: float = quantity(0.30, unit="m", low=0.01, high=100, help="spiral: radius; moebius: radius of the centre circle")
     climb_m: float = quantity(0.40, unit="m", low=-100, high=100, help="spiral: height gained")
-    turns: float = quantity(2.0, low=0.01, high=1000, help="spiral: turns, seen from above clockwise; moebius: laps")
+    turns: float = quantity(2.0, low=0.01, high=1000, help="spiral: turns, clockwise seen from above; moebius: laps; lissajous: cycles")
     half_width_m: float = quantity(0.30, unit="m", low=0, high=100, help="moebius: half-width of the strip")
-    stick: float = quantity(0.6, low=0, high=1, help="force: largest deflection")
-    amplitude_m: np.ndarray = quantity([1, 1, 0], unit="m", low=0, high=100, shape=(3,), help="lissajous: of each axis")
-    frequency: np.ndarray = quantity([1, 2, 1], low=0, high=100, shape=(3,), help="lissajous: of each axis")
-    yaw_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of yaw a turn of u")
-    roll_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of roll a turn of u")
-    file: str = quantity("", help="waypoints: CSV or TOML file of waypoints (prepare/waypoints.py), from the scenario's folder")
-    file_text: str = quantity("", help="what is in `file`, read with the scenario, which then flies where the file is not")
+    stick: float = quantity(0.6, low=0, high=1, help="force: largest stick deflection")
+    amplitude_m: np.ndarray = quantity([1, 1, 0], unit="m", low=0, high=100, shape=(3,), help="lissajous: amplitude along each axis")
+    frequency: np.ndarray = quantity([1, 2, 1], low=0, high=100, shape=(3,), help="lissajous: frequency along each axis")
+    yaw_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of yaw per turn of u")
+    roll_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of roll per turn of u")
+    file: str = quantity("", help="waypoints: CSV or TOML file (prepare/waypoints.py), relative to the scenario's folder")
+    file_text: str = quantity("", help="text of `file`, read with the scenario, which can then be flown without the file")
     centre_m: np.ndarray = quantity(
         [0, 0, 0],
         unit="m",
         low=-1000,
         high=1000,
         shape=(3,),
-        help="hover: place; spiral: bottom of its axis; moebius: centre",
+        help="hover: position; spiral: bottom of its axis; moebius and lissajous: centre",
     )
 
     @property
@@ -170,18 +172,18 @@ class Check:
     metric: str = quantity(help="name of the metric in result.json")
     low: float = quantity(-UNBOUNDED, help="smallest value that passes")
     high: float = quantity(UNBOUNDED, help="largest value that passes")
-    ideal: bool = quantity(True, help="checked with ideal sensors too, which are better than the estimator believes")
+    ideal: bool = quantity(True, help="whether the check also applies with ideal sensors, which beat the assumed noise of the estimator")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Scenario:
     """One scenario."""
 
-    name: str = quantity(help="as in the file's name")
-    help: str = quantity(help="one line for `modcube hil list`")
+    name: str = quantity(help="name of the scenario, same as that of its file")
+    help: str = quantity(help="one-line description for `modcube hil list`")
     tank: Tank = quantity()
     module: tuple[ModuleStart, ...] = quantity()
-    tags: tuple[int, ...] = quantity((5,), low=0, high=15, help="tags that the modules carry; 5 is the top face")
+    tags: tuple[int, ...] = quantity((5,), low=0, high=15, help="ids of the tags that modules carry; 5 is the top face")
     camera: tuple[CameraPose, ...] = quantity(())
     polycube: Polycube | None = quantity(None)
     start: RandomStart = quantity(RandomStart())

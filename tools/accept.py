@@ -102,8 +102,8 @@ def print_outcomes(entries: Sequence[Mapping[str, Any]]) -> None:
 
 @app.command()
 def main(
-    only: Annotated[list[str] | None, typer.Option(help="group to measure; may be given again")] = None,
-    out: Annotated[Path, typer.Option(help="where the entries go")] = OUT,
+    only: Annotated[list[str] | None, typer.Option(help="group to measure; may be given more than once")] = None,
+    out: Annotated[Path, typer.Option(help="file for the measured entries")] = OUT,
 ) -> None:
     """Measure the acceptance figures; status 1 when one of those measured fails."""
     names = [group.name for group in GROUPS]

@@ -118,8 +118,8 @@ def lateness_entries() -> list[Entry]:
 def main() -> None:
     """Flies once and prints the results."""
     parser = Parser(description=__doc__)
-    parser.add_argument("rate", type=int, help="ticks a second")
-    parser.add_argument("seconds", type=float, help="of the flight")
+    parser.add_argument("rate", type=int, help="tick rate, Hz")
+    parser.add_argument("seconds", type=float, help="duration of the flight, s")
     given = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):  # the bench pins itself to one core, a vehicle does not
         os.sched_setaffinity(0, range(os.cpu_count() or 1))

@@ -180,12 +180,12 @@ def draw(path: Path, tables: dict[str, DragTable]) -> None:
 @app.command()
 def main(
     vehicle: Annotated[str, typer.Option(help="vehicle name or file")] = "modcube",
-    cells: Annotated[str, typer.Option(help="cells, as '0,0,0 1,0,0'; the paper's three shapes if left out")] = "",
-    mode: Annotated[str, typer.Option(help="way to the outline: exact, alpha or random")] = "exact",
-    compare: Annotated[bool, typer.Option(help="set the three modes side by side (minutes)")] = False,
-    directions: Annotated[int, typer.Option(min=10, max=100000, help="directions of the comparison")] = 1000,
-    out: Annotated[Path, typer.Option(help="picture of the drag spaces")] = Path("drag_spaces.png"),
-    cache: Annotated[Path | None, typer.Option(help="folder of kept outlines; the user's cache when left out")] = None,
+    cells: Annotated[str, typer.Option(help="cells, such as '0,0,0 1,0,0'; without them the paper's three shapes")] = "",
+    mode: Annotated[str, typer.Option(help="method for the outline: exact, alpha or random")] = "exact",
+    compare: Annotated[bool, typer.Option(help="compare the three methods (takes minutes)")] = False,
+    directions: Annotated[int, typer.Option(min=10, max=100000, help="number of directions in the comparison")] = 1000,
+    out: Annotated[Path, typer.Option(help="picture file for the drag spaces")] = Path("drag_spaces.png"),
+    cache: Annotated[Path | None, typer.Option(help="folder for cached outlines; the user's cache by default")] = None,
 ) -> None:
     """Build drag tables, print the force in the paper's seven flow directions, draw the drag spaces."""
     console = Console(highlight=False)

@@ -84,9 +84,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Runs the tool; returns its exit status."""
     parser = Parser(prog="bus_load", description="bus load from the DBC")
     parser.add_argument("--fleet", type=Path, help="fleet file")
-    parser.add_argument("--rate", type=int, help="ticks a second, 50 to 400, in place of the fleet's")
+    parser.add_argument("--rate", type=int, help="tick rate, Hz, 50 to 400, in place of the fleet's")
     parser.add_argument("--dbc", type=Path, help="folder for one expanded DBC per bus")
-    parser.add_argument("--details", action="store_true", help="what each message takes")
+    parser.add_argument("--details", action="store_true", help="print the bus load of each message")
     given = parser.parse_args(arguments)
     if given.rate is not None and not 50 <= given.rate <= 400:
         parser.error(f"argument --rate: {given.rate} is outside 50 to 400")

@@ -70,17 +70,21 @@ def arguments() -> argparse.Namespace:
     parser.add_argument(
         "--assembly", metavar="SHAPE", help="AxBxC modules, cells such as '0,0,0 1,0,0', or a fleet file"
     )
-    parser.add_argument("--module", metavar="VEHICLE", help=f"of every module of an assembly of AxBxC or of cells; {MODULE} by default")
-    parser.add_argument("--table1", action="store_true", help="the paper's seven robots beside its Table I")
+    parser.add_argument(
+        "--module", metavar="VEHICLE", help=f"vehicle of every module of an assembly given as AxBxC or as cells; {MODULE} by default"
+    )
+    parser.add_argument("--table1", action="store_true", help="characterise the paper's seven robots and compare them with Table I")
     parser.add_argument("--choose", type=whole(1), metavar="N", help="rank all shapes of N modules, 1 to 5")
     parser.add_argument("--task", type=Path, metavar="FILE", help="task file for --choose")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="CSV, JSON, figure (PNG) and report (HTML) go there")
-    parser.add_argument("--directions", type=whole(1), default=DIRECTIONS, help="directions over the sphere, 121 or more")
-    parser.add_argument("--force", type=positive, default=1.0, metavar="N", help="wrench of the power space, force frame")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for CSV, JSON, figure (PNG) and report (HTML)")
+    parser.add_argument("--directions", type=whole(1), default=DIRECTIONS, help="number of directions over the sphere, 121 or more")
     parser.add_argument(
-        "--torque", type=positive, default=1.0, metavar="NM", help="wrench of the power space, torque frame"
+        "--force", type=positive, default=1.0, metavar="N", help="force for which the power space in the force frame is computed, N"
     )
-    parser.add_argument("--jobs", type=whole(1), default=2, help="processes")
+    parser.add_argument(
+        "--torque", type=positive, default=1.0, metavar="NM", help="torque for which the power space in the torque frame is computed, N m"
+    )
+    parser.add_argument("--jobs", type=whole(1), default=2, help="number of parallel processes")
     given = parser.parse_args()
     if sum([bool(given.vehicle), given.assembly is not None, given.table1, given.choose is not None]) != 1:
         parser.error("give one of: vehicles, --assembly SHAPE, --table1, --choose N --task FILE")

@@ -133,7 +133,7 @@ def page() -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Writes or checks the page."""
     parser = Parser(description="draw docs/supervisor.md from the supervisor's tables")
-    parser.add_argument("--check", action="store_true", help="only say whether it is up to date")
+    parser.add_argument("--check", action="store_true", help="only check whether the page is up to date (status 1 if not)")
     if parser.parse_args(arguments).check:
         return 0 if PAGE.exists() and PAGE.read_text(encoding="utf-8") == page() else 1
     PAGE.parent.mkdir(exist_ok=True)

@@ -179,11 +179,11 @@ def check_out(path: Path) -> None:
 def main() -> int:
     """Runs the tool; returns its exit status."""
     parser = Parser(description=__doc__)
-    parser.add_argument("csv", type=Path, help="the measurement")
-    parser.add_argument("--voltage", type=float, help="V of the curve; else the vehicle's")
-    parser.add_argument("--zero", type=float, default=0.05, metavar="N", help="size of a force that counts as none")
-    parser.add_argument("--vehicle", default="modcube", help="whose curve is taken for what was not measured")
-    parser.add_argument("--out", type=Path, default=Path("curve.toml"), help="the file to write")
+    parser.add_argument("csv", type=Path, help="CSV file of the measurement")
+    parser.add_argument("--voltage", type=float, help="supply voltage of the curve, V; the vehicle's by default")
+    parser.add_argument("--zero", type=float, default=0.05, metavar="N", help="magnitude up to which a force counts as zero")
+    parser.add_argument("--vehicle", default="modcube", help="vehicle whose curve provides what was not measured")
+    parser.add_argument("--out", type=Path, default=Path("curve.toml"), help="file to write the curve to")
     given = parser.parse_args()
     try:
         like = load_vehicle(given.vehicle).curve

@@ -197,20 +197,22 @@ def look_or_go_back(vehicle: Vehicle, given: argparse.Namespace, say: Callable[[
 def parse(arguments: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
     parser = Parser(prog="flash", description="Puts this checkout's release on a vehicle, over OpenSSH.")
-    parser.add_argument("host", metavar="USER@HOST", help="as ssh takes it")
+    parser.add_argument("host", metavar="USER@HOST", help="vehicle, as given to ssh")
     what = parser.add_mutually_exclusive_group()
-    what.add_argument("--status", action="store_true", help="what is installed and how it runs")
-    what.add_argument("--rollback", action="store_true", help="back to the release before")
-    what.add_argument("--dry-run", action="store_true", help="check everything, change nothing")
-    parser.add_argument("--armed", action="store_true", help="also while it is armed: its service is stopped in flight")
-    parser.add_argument("--offline", action="store_true", help="wheels from the cache alone")
-    parser.add_argument("--root", default="/opt/modcube", help="folder on the vehicle")
-    parser.add_argument("--python", default="python3.12 python3.11 python3", help="interpreters to try there")
-    parser.add_argument("--port", type=int, help="of ssh")
-    parser.add_argument("--identity", type=Path, help="private key file")
-    parser.add_argument("--ssh-option", action="append", default=[], metavar="KEY=VALUE", help="for ssh -o")
+    what.add_argument("--status", action="store_true", help="print which releases are installed and the state of the service")
+    what.add_argument("--rollback", action="store_true", help="switch back to the previous release")
+    what.add_argument("--dry-run", action="store_true", help="check everything and change nothing")
+    parser.add_argument("--armed", action="store_true", help="permit flashing an armed vehicle: its service is stopped in flight")
+    parser.add_argument("--offline", action="store_true", help="use wheels from the cache only")
+    parser.add_argument("--root", default="/opt/modcube", help="folder of the releases on the vehicle")
+    parser.add_argument("--python", default="python3.12 python3.11 python3", help="Python interpreters to try on the vehicle, in order")
+    parser.add_argument("--port", type=int, help="ssh port")
+    parser.add_argument("--identity", type=Path, help="ssh private key file")
+    parser.add_argument(
+        "--ssh-option", action="append", default=[], metavar="KEY=VALUE", help="option passed to ssh -o; may be given more than once"
+    )
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "modcube" / "wheels"
-    parser.add_argument("--cache", type=Path, default=cache, help="folder of fetched wheels")
+    parser.add_argument("--cache", type=Path, default=cache, help="folder for downloaded wheels")
     return parser.parse_args(arguments)
 
 

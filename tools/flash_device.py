@@ -400,7 +400,7 @@ def parse(words: Sequence[str] | None) -> argparse.Namespace:
     """Parses the command line."""
     parser = Parser(prog="flash_device", description="Installs and switches releases; flash.py runs it on the vehicle.")
     parser.add_argument("root", type=Path, help="folder of the releases")
-    parser.add_argument("command", choices=COMMANDS, help="all but boot and status take JSON on standard input")
+    parser.add_argument("command", choices=COMMANDS, help="command to run; all but boot and status read JSON from standard input")
     return parser.parse_args(words)
 
 

@@ -135,7 +135,7 @@ def definition(message: MessageCodec, field: Field) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Writes the files; returns the exit status."""
     parser = Parser(prog="generate_mcu_code", description="C for the microcontrollers, from the DBC")
-    parser.add_argument("folder", type=Path, help="where the four files go")
+    parser.add_argument("folder", type=Path, help="folder for the four generated files")
     folder: Path = parser.parse_args(arguments).folder
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -190,16 +190,21 @@ def leave(given: argparse.Namespace, result: Fit, recording: Recording, curve: T
 def main() -> int:
     """Runs the tool; returns its exit status."""
     parser = Parser(description=__doc__)
-    parser.add_argument("logs", nargs="*", metavar="LOG", help="folders of flights of one vehicle, one module alone")
-    parser.add_argument("--curve", type=Path, metavar="FILE", help="curve of one thruster, from tools/fit_thruster.py")
-    parser.add_argument("--thruster", type=int, help="which thruster that was, 1 the first (default)")
-    parser.add_argument("--accuracy", type=float, metavar="PERCENT", help="bounds of the load cell's scale, 2 by default")
-    parser.add_argument("--weight", metavar="NEWTON:KG:FROM:UNTIL", default="", help="a known weight hung on so long")
-    parser.add_argument("--hung-at", type=float, nargs=3, metavar="M", help="where, x y z of the body; else the middle of its bottom")
-    parser.add_argument("--excitation", type=Path, metavar="FILE", help="where the scenario of the missing motions goes")
-    parser.add_argument("--space", type=float, nargs=3, metavar="M", default=list(SPACE_M), help="room to either side, world x y z")
-    parser.add_argument("--vehicle", default="modcube", help="of the flight to begin with")
-    parser.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/identify"), help="for what is found")
+    parser.add_argument("logs", nargs="*", metavar="LOG", help="folders of flights of one vehicle, a single module")
+    parser.add_argument("--curve", type=Path, metavar="FILE", help="measured curve of one thruster, from tools/fit_thruster.py")
+    parser.add_argument("--thruster", type=int, help="number of the measured thruster; the first one is 1 (default)")
+    parser.add_argument("--accuracy", type=float, metavar="PERCENT", help="error bound of the scale of the load cell, 2 by default")
+    parser.add_argument(
+        "--weight", metavar="NEWTON:KG:FROM:UNTIL", default="", help="known weight that hung on the robot, between two times of the log"
+    )
+    parser.add_argument(
+        "--hung-at", type=float, nargs=3, metavar="M",
+        help="point at which the weight hung, x y z of the body; default: middle of the bottom"
+    )
+    parser.add_argument("--excitation", type=Path, metavar="FILE", help="scenario file to write, with the motions that are missing")
+    parser.add_argument("--space", type=float, nargs=3, metavar="M", default=list(SPACE_M), help="free space to either side, world x y z")
+    parser.add_argument("--vehicle", default="modcube", help="vehicle of the excitation flight when no log is given")
+    parser.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/identify"), help="folder for the results")
     try:
         return identify(parser.parse_args())
     except (DescriptionError, OSError) as error:

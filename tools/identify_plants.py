@@ -116,9 +116,9 @@ def main() -> int:
     parser = Parser(description=__doc__)
     parser.add_argument("--plants", type=whole(1), default=10, help="number of seeds")
     parser.add_argument("--seed", type=whole(0), default=0, help="first seed")
-    parser.add_argument("--jobs", type=whole(1), default=2, help="processes")
-    parser.add_argument("--seconds", type=positive, default=170.0, help="of each flight, after it has settled")
-    parser.add_argument("--out", type=Path, default=Path("runs/plants"), help="for logs and plants.json")
+    parser.add_argument("--jobs", type=whole(1), default=2, help="number of parallel processes")
+    parser.add_argument("--seconds", type=positive, default=170.0, help="duration of each flight after settling, s")
+    parser.add_argument("--out", type=Path, default=Path("runs/plants"), help="folder for logs and plants.json")
     given = parser.parse_args()
     try:
         with folder_for_results(given.out):

@@ -179,11 +179,13 @@ def leave(out: Path, found: Found) -> int:
 def main() -> int:
     """Runs the tool; returns its exit status."""
     parser = Parser(description=__doc__)
-    parser.add_argument("--modules", type=int, nargs="+", choices=list(BODIES), default=list(BODIES), help="sizes of body")
-    parser.add_argument("--controller", default="modcube", help=f"{', '.join(CONTROLLERS)}, or a file of parameters")
+    parser.add_argument(
+        "--modules", type=int, nargs="+", choices=list(BODIES), default=list(BODIES), help="numbers of modules of the bodies"
+    )
+    parser.add_argument("--controller", default="modcube", help=f"{', '.join(CONTROLLERS)}, or a parameter file")
     parser.add_argument("--vehicle", default="modcube", help="vehicle of every module")
-    parser.add_argument("--jobs", type=whole(1), default=2, help="processes")
-    parser.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/margins"), help="for margins.json and margins.png")
+    parser.add_argument("--jobs", type=whole(1), default=2, help="number of parallel processes")
+    parser.add_argument("--out", type=Path, metavar="DIR", default=Path("runs/margins"), help="folder for margins.json and margins.png")
     given = parser.parse_args()
     try:
         check_bodies(given.modules, given.vehicle)

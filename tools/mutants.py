@@ -242,9 +242,9 @@ def run(name: str, todo: list[Mutant], jobs: int) -> list[Mutant]:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Runs all mutants of the requested modules; returns the exit status."""
     parser = Parser(description=__doc__.splitlines()[0] if __doc__ else "")
-    parser.add_argument("module", nargs="*", help="last part of a module's name; all when none is given")
-    parser.add_argument("--jobs", type=whole(1), default=os.cpu_count() or 1, help="processes")
-    parser.add_argument("--list", action="store_true", help="only say what would be tried")
+    parser.add_argument("module", nargs="*", help="last part of a module's name; all modules if none is given")
+    parser.add_argument("--jobs", type=whole(1), default=os.cpu_count() or 1, help="number of parallel processes")
+    parser.add_argument("--list", action="store_true", help="only list the mutants, without running tests")
     options = parser.parse_args(arguments)
     short = [name.rpartition(".")[2] for name in TARGETS]
     if unknown := [name for name in options.module if name not in short]:

@@ -116,17 +116,25 @@ def arguments() -> argparse.Namespace:
     """Parses and checks the command line."""
     parser = Parser(description=__doc__)
     parser.add_argument("objective", type=Path, help="objective file, such as tools/objectives/spiral.toml")
-    parser.add_argument("--trials", type=whole(1), default=40, help="trials in all, earlier ones in the same folder counted")
-    parser.add_argument("--minutes", type=positive, default=float("inf"), help="no trial is begun after so long")
-    parser.add_argument("--jobs", type=whole(1), default=2, help="processes")
-    parser.add_argument("--dask", metavar="ADDRESS", default="", help="scheduler of a dask cluster, tcp://HOST:PORT, in place of processes")
-    parser.add_argument("--start", type=Path, help="parameter file to start from; the shipped gains without it")
-    parser.add_argument("--detune", type=whole(0), metavar="SEED", help=f"put each gain of the start off by a factor of up to {DETUNED:g}")
-    parser.add_argument("--seed", type=whole(0), default=0, help="of the search itself")
-    parser.add_argument("--no-plots", action="store_true", help="leave the plots out")
-    parser.add_argument("--live", metavar="mavlink:ADDRESS", help="tune the vehicle there, step by step, in place of the bench")
-    parser.add_argument("--seconds", type=positive, metavar="SECONDS", help=f"--live: how long each step is looked at, {LOOK_S:g}")
-    parser.add_argument("--out", type=Path, default=Path("runs/tune"), metavar="DIR", help="for trials, parameters.toml and tuning.json")
+    parser.add_argument("--trials", type=whole(1), default=40, help="total number of trials, including earlier ones in the same folder")
+    parser.add_argument("--minutes", type=positive, default=float("inf"), help="time after which no new trial starts")
+    parser.add_argument("--jobs", type=whole(1), default=2, help="number of parallel processes")
+    parser.add_argument(
+        "--dask", metavar="ADDRESS", default="", help="scheduler of a dask cluster, tcp://HOST:PORT, in place of local processes"
+    )
+    parser.add_argument("--start", type=Path, help="parameter file to start from; default: the shipped gains")
+    parser.add_argument(
+        "--detune", type=whole(0), metavar="SEED", help=f"detune each gain of the start by a random factor of up to {DETUNED:g}"
+    )
+    parser.add_argument("--seed", type=whole(0), default=0, help="seed of the search")
+    parser.add_argument("--no-plots", action="store_true", help="do not draw plots")
+    parser.add_argument("--live", metavar="mavlink:ADDRESS", help="tune the vehicle at this address, step by step, in place of the bench")
+    parser.add_argument(
+        "--seconds", type=positive, metavar="SECONDS", help=f"--live: time for which each step is observed, {LOOK_S:g} by default"
+    )
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/tune"), metavar="DIR", help="folder for trials, parameters.toml and tuning.json"
+    )
     given = parser.parse_args()
     if given.seconds is not None and not given.live:
         parser.error("--seconds tells how long each step on a vehicle is looked at; give --live with it")

@@ -28,11 +28,11 @@ FAILED_COST = 1e6
 class FlightSpec:
     """One flight of the objective."""
 
-    scenario: str = quantity(help="name of a scenario")
-    vehicle: str = quantity("", help="vehicle in place of the scenario's")
-    settle_s: float = quantity(0.0, unit="s", low=0, high=60, help="held before the task; 0: as the scenario has it")
-    duration_s: float = quantity(0.0, unit="s", low=0, high=600, help="of the task; 0: as the scenario has it")
-    weight: float = quantity(1.0, low=0, high=1e3, help="share in the sum")
+    scenario: str = quantity(help="scenario name")
+    vehicle: str = quantity("", help="vehicle name or file, in place of the scenario's")
+    settle_s: float = quantity(0.0, unit="s", low=0, high=60, help="time that the robot holds its start before the task; 0: the scenario's")
+    duration_s: float = quantity(0.0, unit="s", low=0, high=600, help="duration of the task; 0: the scenario's")
+    weight: float = quantity(1.0, low=0, high=1e3, help="weight of the flight's cost in the objective")
 
     def flown(self) -> Scenario:
         """The scenario with its changes applied. Raises DescriptionError."""
@@ -49,33 +49,33 @@ class FlightSpec:
 class Search:
     """One parameter to search, and its bounds."""
 
-    parameter: str = quantity(help="as group.field")
-    low: float = quantity(help="lowest tried")
-    high: float = quantity(help="highest tried")
-    logarithmic: bool = quantity(False, help="search on a logarithmic scale")
+    parameter: str = quantity(help="parameter name, group.field")
+    low: float = quantity(help="lower bound of the search")
+    high: float = quantity(help="upper bound of the search")
+    logarithmic: bool = quantity(False, help="whether the parameter is searched on a logarithmic scale")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Term:
     """Cost of a metric."""
 
-    metric: str = quantity(help="name in result.json")
-    per: float = quantity(low=1e-12, high=1e12, help="this much of the metric costs `weight`")
-    weight: float = quantity(1.0, low=0, high=1e3, help="cost of `per`")
+    metric: str = quantity(help="name of the metric in result.json")
+    per: float = quantity(low=1e-12, high=1e12, help="amount of the metric that costs `weight`")
+    weight: float = quantity(1.0, low=0, high=1e3, help="cost of an amount `per` of the metric")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Stability:
     """Margins that the loops broken at the plant's input should keep in one world; a shortfall has a cost."""
 
-    modules: int = quantity(1, low=1, high=4, help="of the body: 1, 2 or 4")
-    mass: float = quantity(1.0, low=0.5, high=2, help="factor of the mass that the controller believes")
-    inertia: float = quantity(1.0, low=0.5, high=2, help="the same of the inertia")
-    lag: float = quantity(1.0, low=0.5, high=2, help="the same of the thrusters' lag")
-    gain_db: float = quantity(unit="dB", low=0, high=60, help="gain margin of every axis")
-    phase_deg: float = quantity(unit="deg", low=0, high=180, help="phase margin of every axis")
-    per_db: float = quantity(low=1e-3, high=60, help="so many dB too little cost 1")
-    per_deg: float = quantity(low=1e-3, high=180, help="so many degrees too little cost 1")
+    modules: int = quantity(1, low=1, high=4, help="number of modules of the body: 1, 2 or 4")
+    mass: float = quantity(1.0, low=0.5, high=2, help="mass in this world, as a factor of the controller's model")
+    inertia: float = quantity(1.0, low=0.5, high=2, help="inertia in this world, as a factor of the controller's model")
+    lag: float = quantity(1.0, low=0.5, high=2, help="thruster lag in this world, as a factor of the controller's model")
+    gain_db: float = quantity(unit="dB", low=0, high=60, help="wanted gain margin of every axis")
+    phase_deg: float = quantity(unit="deg", low=0, high=180, help="wanted phase margin of every axis")
+    per_db: float = quantity(low=1e-3, high=60, help="shortfall of the gain margin, dB, that costs 1")
+    per_deg: float = quantity(low=1e-3, high=180, help="shortfall of the phase margin, degrees, that costs 1")
 
     def cost(self, gain_db: float, phase_deg: float) -> float:
         """Cost of the margins, given the least gain margin and the least phase margin of all axes."""
@@ -86,14 +86,14 @@ class Stability:
 class Objective:
     """The objective to minimise."""
 
-    help: str = quantity(help="one line")
-    flight: tuple[FlightSpec, ...] = quantity(help="flights of each seed, the cheapest to fly first: a bad trial ends early")
-    search: tuple[Search, ...] = quantity(help="what may change")
-    term: tuple[Term, ...] = quantity(help="what costs")
-    seeds: tuple[int, ...] = quantity(low=0, high=2**31, help="worlds of the search")
-    unseen_seeds: tuple[int, ...] = quantity(low=0, high=2**31, help="worlds of the comparison")
-    worst_share: float = quantity(0.0, low=0, high=1, help="share of the worst flight in the objective")
-    stability: tuple[Stability, ...] = quantity((), help="margins to keep")
+    help: str = quantity(help="one-line description")
+    flight: tuple[FlightSpec, ...] = quantity(help="flights of each seed, the cheapest first, so that a bad trial ends early")
+    search: tuple[Search, ...] = quantity(help="parameters to search")
+    term: tuple[Term, ...] = quantity(help="metrics that have a cost")
+    seeds: tuple[int, ...] = quantity(low=0, high=2**31, help="seeds of the worlds used by the search")
+    unseen_seeds: tuple[int, ...] = quantity(low=0, high=2**31, help="seeds of the worlds used for the comparison only")
+    worst_share: float = quantity(0.0, low=0, high=1, help="weight of the worst flight in the objective, 0 to 1; the rest is the mean")
+    stability: tuple[Stability, ...] = quantity((), help="gain and phase margins to keep")
 
     def __post_init__(self) -> None:
         for name in ("flight", "search", "term", "seeds", "unseen_seeds"):

@@ -10,13 +10,13 @@ from typing import Any
 
 from firmware_py.description.schema import quantity
 
-ACTION = "0 none, 1 warn, 2 hold place, 3 hold depth and attitude, 4 surface, 5 disarm"
-LATCHED = "1: ends by disarming only, 0: also when its cause is gone for clear_s"
+ACTION = "0 none, 1 warn, 2 hold position, 3 hold depth and attitude, 4 surface, 5 disarm"
+LATCHED = "1: latched until disarmed, 0: ends once the cause has been gone for clear_s"
 
 
 def delay(default_s: float, mavlink: str) -> Any:
     """A field for the time that the cause must last."""
-    return quantity(default_s, unit="s", low=0, high=600, help="how long before it acts", mavlink=mavlink)
+    return quantity(default_s, unit="s", low=0, high=600, help="time the cause must last before the fail-safe acts", mavlink=mavlink)
 
 
 def action(default: int, mavlink: str) -> Any:
@@ -39,7 +39,7 @@ class Failsafes:
     leak_latched: int = latched(1, "FS_LEAK_LAT")
     # every module silent: the bus is off, and thrusters stop by themselves
     bus_silent_limit: float = quantity(
-        2.0, unit="s", low=0.1, high=60, help="no module was heard for longer", mavlink="FS_BUS_LIM"
+        2.0, unit="s", low=0.1, high=60, help="longest permitted time without a frame from any module", mavlink="FS_BUS_LIM"
     )
     bus_silent_delay_s: float = delay(0.0, "FS_BUS_S")
     bus_silent_action: int = action(5, "FS_BUS_ACT")
@@ -54,21 +54,22 @@ class Failsafes:
     foreign_command_latched: int = latched(0, "FS_CMD_LAT")
     # battery nearly empty
     battery_critical_limit: float = quantity(
-        0.8, low=0.3, high=1.2, help="voltage below this share of the nominal one", mavlink="FS_BATC_LIM"
+        0.8, low=0.3, high=1.2, help="lowest permitted supply voltage, as a share of the nominal voltage", mavlink="FS_BATC_LIM"
     )
     battery_critical_delay_s: float = delay(5.0, "FS_BATC_S")
     battery_critical_action: int = action(4, "FS_BATC_ACT")
     battery_critical_latched: int = latched(1, "FS_BATC_LAT")
     # electronics too hot
     cabin_hot_limit: float = quantity(
-        70.0, unit="degC", low=0, high=150, help="cabin temperature above this", mavlink="FS_HOT_LIM"
+        70.0, unit="degC", low=0, high=150, help="highest permitted cabin temperature", mavlink="FS_HOT_LIM"
     )
     cabin_hot_delay_s: float = delay(5.0, "FS_HOT_S")
     cabin_hot_action: int = action(4, "FS_HOT_ACT")
     cabin_hot_latched: int = latched(0, "FS_HOT_LAT")
     # the hull fails
     cabin_pressure_limit: float = quantity(
-        20000.0, unit="Pa", low=100, high=200000, help="cabin pressure off its first reading by more", mavlink="FS_CABP_LIM"
+        20000.0, unit="Pa", low=100, high=200000,
+        help="largest permitted change of a cabin's pressure since its first reading", mavlink="FS_CABP_LIM"
     )
     cabin_pressure_delay_s: float = delay(2.0, "FS_CABP_S")
     cabin_pressure_action: int = action(4, "FS_CABP_ACT")
@@ -79,7 +80,7 @@ class Failsafes:
     axis_lost_latched: int = latched(1, "FS_AXIS_LAT")
     # depth unknown
     depth_unknown_limit: float = quantity(
-        5.0, unit="s", low=0.1, high=600, help="neither pressure nor tag for longer", mavlink="FS_DEPU_LIM"
+        5.0, unit="s", low=0.1, high=600, help="longest permitted time with neither a pressure reading nor a tag", mavlink="FS_DEPU_LIM"
     )
     depth_unknown_delay_s: float = delay(0.0, "FS_DEPU_S")
     depth_unknown_action: int = action(4, "FS_DEPU_ACT")
@@ -87,7 +88,8 @@ class Failsafes:
     # tags do not come back: a body that a fail-safe holds at its depth surfaces, 30 s after the last tag, or 22 s after the loss of a pilot
     # who flew without tags
     tag_gone_limit: float = quantity(
-        8.0, unit="s", low=0.1, high=3600, help="no tag for longer", mavlink="FS_TAGG_LIM"
+        8.0, unit="s", low=0.1, high=3600,
+        help="longest permitted time without a tag; counts also in an ALT_HOLD that a fail-safe chose", mavlink="FS_TAGG_LIM"
     )
     tag_gone_delay_s: float = delay(22.0, "FS_TAGG_S")
     tag_gone_action: int = action(4, "FS_TAGG_ACT")
@@ -95,85 +97,93 @@ class Failsafes:
     # a docked partner is lost
     partner_lost_delay_s: float = delay(0.4, "FS_PART_S")
     partner_lost_action: int = quantity(
-        2, low=0, high=5, help=f"{ACTION}; with 0 a body that has come apart is flown on as one", mavlink="FS_PART_ACT"
+        2, low=0, high=5, help=f"{ACTION}; with 0 a body that has come apart is still flown as one", mavlink="FS_PART_ACT"
     )
     partner_lost_latched: int = latched(0, "FS_PART_LAT")
     # sensors and model disagree
     estimator_limit: float = quantity(
-        5.0, low=1.5, high=100, help="innovations over their expectation, mean of a second", mavlink="FS_EST_LIM"
+        5.0, low=1.5, high=100, help="largest permitted NIS of the tags over its expected value, mean over one second", mavlink="FS_EST_LIM"
     )
     estimator_delay_s: float = delay(2.0, "FS_EST_S")
     estimator_action: int = action(3, "FS_EST_ACT")
     estimator_latched: int = latched(0, "FS_EST_LAT")
     # the gate rejects tags
     rejected_limit: float = quantity(
-        0.8, low=0.05, high=1, help="share of tags refused by the gate, mean of a second", mavlink="FS_REJ_LIM"
+        0.8, low=0.05, high=1, help="largest permitted share of tags rejected by the gate, mean over one second", mavlink="FS_REJ_LIM"
     )
     rejected_delay_s: float = delay(2.0, "FS_REJ_S")
     rejected_action: int = action(3, "FS_REJ_ACT")
     rejected_latched: int = latched(0, "FS_REJ_LAT")
     # position unknown
-    tag_lost_limit: float = quantity(8.0, unit="s", low=0.1, high=600, help="no tag for longer", mavlink="FS_TAGL_LIM")
+    tag_lost_limit: float = quantity(
+        8.0, unit="s", low=0.1, high=600,
+        help="longest permitted time without a tag in modes that hold or follow a position", mavlink="FS_TAGL_LIM"
+    )
     tag_lost_delay_s: float = delay(0.0, "FS_TAGL_S")
     tag_lost_action: int = action(3, "FS_TAGL_ACT")
     tag_lost_latched: int = latched(0, "FS_TAGL_LAT")
     # a wall, a hand or a rope pushes while no tag is seen: the estimated position runs away
     pushed_limit: float = quantity(
-        0.5, unit="m/s", low=0.05, high=10, help="without tags pushed harder than by such a current on the mean", mavlink="FS_PUSH_LIM"
+        0.5, unit="m/s", low=0.05, high=10,
+        help="largest permitted push without tags, as speed of an equivalent current, RMS over one second", mavlink="FS_PUSH_LIM"
     )
     pushed_delay_s: float = delay(0.5, "FS_PUSH_S")
     pushed_action: int = action(3, "FS_PUSH_ACT")
     pushed_latched: int = latched(0, "FS_PUSH_LAT")
     # position uncertain
     tag_late_limit: float = quantity(
-        1.0, unit="s", low=0.05, high=60, help="no tag for longer while on the move", mavlink="FS_TAGM_LIM"
+        1.0, unit="s", low=0.05, high=60,
+        help="longest permitted time without a tag in position modes other than POSHOLD", mavlink="FS_TAGM_LIM"
     )
     tag_late_delay_s: float = delay(0.0, "FS_TAGM_S")
     tag_late_action: int = action(2, "FS_TAGM_ACT")
     tag_late_latched: int = latched(0, "FS_TAGM_LAT")
     # pressure sensor lost
     depth_lost_limit: float = quantity(
-        1.0, unit="s", low=0.1, high=60, help="no pressure for longer", mavlink="FS_DEPL_LIM"
+        1.0, unit="s", low=0.1, high=60, help="longest permitted time without a pressure reading", mavlink="FS_DEPL_LIM"
     )
     depth_lost_delay_s: float = delay(0.0, "FS_DEPL_S")
     depth_lost_action: int = action(1, "FS_DEPL_ACT")
     depth_lost_latched: int = latched(0, "FS_DEPL_LAT")
     # the IMU is silent, faulty or frozen
     imu_lost_limit: float = quantity(
-        0.5, unit="s", low=0.1, high=60, help="no IMU of the body gave a sample to believe for longer", mavlink="FS_IMU_LIM"
+        0.5, unit="s", low=0.1, high=60,
+        help="longest permitted time without a trusted IMU sample from any module of the body", mavlink="FS_IMU_LIM"
     )
     imu_lost_delay_s: float = delay(0.0, "FS_IMU_S")
     imu_lost_action: int = action(2, "FS_IMU_ACT")
     imu_lost_latched: int = latched(0, "FS_IMU_LAT")
     # a CAN node is silent
     module_silent_limit: float = quantity(
-        0.5, unit="s", low=0.1, high=60, help="a module was not heard for longer", mavlink="FS_MOD_LIM"
+        0.5, unit="s", low=0.1, high=60, help="longest permitted silence of a single module", mavlink="FS_MOD_LIM"
     )
     module_silent_delay_s: float = delay(0.0, "FS_MOD_S")
     module_silent_action: int = action(2, "FS_MOD_ACT")
     module_silent_latched: int = latched(0, "FS_MOD_LAT")
     # the controller is late
     ticks_missed_limit: float = quantity(
-        5.0, unit="1/s", low=1, high=400, help="ticks missed in a second", mavlink="FS_TICK_LIM"
+        5.0, unit="1/s", low=1, high=400, help="largest permitted rate of missed ticks", mavlink="FS_TICK_LIM"
     )
     ticks_missed_delay_s: float = delay(0.5, "FS_TICK_S")
     ticks_missed_action: int = action(2, "FS_TICK_ACT")
     ticks_missed_latched: int = latched(0, "FS_TICK_LAT")
     # outside the fence
-    fence_limit: float = quantity(0.0, unit="m", low=0, high=10, help="beyond the fence by more", mavlink="FS_FENC_LIM")
+    fence_limit: float = quantity(
+        0.0, unit="m", low=0, high=10, help="largest permitted distance of the body beyond the fence", mavlink="FS_FENC_LIM"
+    )
     fence_delay_s: float = delay(0.2, "FS_FENC_S")
     fence_action: int = action(2, "FS_FENC_ACT")
     fence_latched: int = latched(0, "FS_FENC_LAT")
     # ground station lost
     ground_lost_limit: float = quantity(
-        5.0, unit="s", low=0.5, high=600, help="ground station silent for longer", mavlink="FS_GCS_LIM"
+        5.0, unit="s", low=0.5, high=600, help="longest permitted silence of the ground station", mavlink="FS_GCS_LIM"
     )
     ground_lost_delay_s: float = delay(0.0, "FS_GCS_S")
     ground_lost_action: int = action(2, "FS_GCS_ACT")
     ground_lost_latched: int = latched(0, "FS_GCS_LAT")
     # pilot input lost
     pilot_lost_limit: float = quantity(
-        1.0, unit="s", low=0.1, high=60, help="no stick input for longer", mavlink="FS_RC_LIM"
+        1.0, unit="s", low=0.1, high=60, help="longest permitted time without stick input", mavlink="FS_RC_LIM"
     )
     pilot_lost_delay_s: float = delay(0.0, "FS_RC_S")
     pilot_lost_action: int = action(2, "FS_RC_ACT")
@@ -184,28 +194,30 @@ class Failsafes:
     thruster_lost_latched: int = latched(1, "FS_THR_LAT")
     # a module does not report whether it leaks: readings come at 5 Hz; the delay allows for the first one
     cabin_unknown_limit: float = quantity(
-        2.0, unit="s", low=0.5, high=60, help="no leak, temperature or pressure of a cabin for longer, to arm too", mavlink="FS_CABU_LIM"
+        2.0, unit="s", low=0.5, high=60,
+        help="largest permitted age of a cabin reading (leak, temperature, pressure), also for arming", mavlink="FS_CABU_LIM"
     )
     cabin_unknown_delay_s: float = delay(1.0, "FS_CABU_S")
     cabin_unknown_action: int = action(1, "FS_CABU_ACT")
     cabin_unknown_latched: int = latched(0, "FS_CABU_LAT")
     # a module does not report its battery voltage
     battery_unknown_limit: float = quantity(
-        2.0, unit="s", low=0.5, high=60, help="no voltage of a module for longer, to arm too", mavlink="FS_BATU_LIM"
+        2.0, unit="s", low=0.5, high=60,
+        help="largest permitted age of a module's supply voltage reading, also for arming", mavlink="FS_BATU_LIM"
     )
     battery_unknown_delay_s: float = delay(1.0, "FS_BATU_S")
     battery_unknown_action: int = action(1, "FS_BATU_ACT")
     battery_unknown_latched: int = latched(0, "FS_BATU_LAT")
     # battery low
     battery_low_limit: float = quantity(
-        0.875, low=0.3, high=1.2, help="voltage below this share of the nominal one", mavlink="FS_BATL_LIM"
+        0.875, low=0.3, high=1.2, help="lowest permitted supply voltage, as a share of the nominal voltage", mavlink="FS_BATL_LIM"
     )
     battery_low_delay_s: float = delay(5.0, "FS_BATL_S")
     battery_low_action: int = action(1, "FS_BATL_ACT")
     battery_low_latched: int = latched(0, "FS_BATL_LAT")
 
     clear_s: float = quantity(
-        2.0, unit="s", low=0, high=60, help="so long a cause must be gone until the fail-safe ends", mavlink="FS_CLEAR_S"
+        2.0, unit="s", low=0, high=60, help="time the cause must be gone before a fail-safe ends", mavlink="FS_CLEAR_S"
     )
 
 
@@ -213,27 +225,37 @@ class Failsafes:
 class Fence:
     """Permitted region of the body's centre of mass, world. Wide open by default: a tank's size belongs in its parameter file."""
 
-    north_m: float = quantity(100.0, unit="m", low=0.1, high=100000.0, help="the farthest it may go north or south", mavlink="FENCE_NORTH")
-    east_m: float = quantity(100.0, unit="m", low=0.1, high=100000.0, help="the farthest it may go east or west", mavlink="FENCE_EAST")
-    top_m: float = quantity(-1.0, unit="m", low=-10, high=1000, help="the least depth", mavlink="FENCE_TOP")
-    bottom_m: float = quantity(50.0, unit="m", low=0.1, high=10000.0, help="the greatest depth", mavlink="FENCE_BOTTOM")
+    north_m: float = quantity(
+        100.0, unit="m", low=0.1, high=100000.0, help="largest permitted distance north or south of the origin", mavlink="FENCE_NORTH"
+    )
+    east_m: float = quantity(
+        100.0, unit="m", low=0.1, high=100000.0, help="largest permitted distance east or west of the origin", mavlink="FENCE_EAST"
+    )
+    top_m: float = quantity(-1.0, unit="m", low=-10, high=1000, help="smallest permitted depth", mavlink="FENCE_TOP")
+    bottom_m: float = quantity(50.0, unit="m", low=0.1, high=10000.0, help="largest permitted depth", mavlink="FENCE_BOTTOM")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Faults:
     """When a thruster counts as dead or as lying (core.faults)."""
 
-    force_n: float = quantity(0.25, unit="N", low=0.05, high=10, help="believed force from which its speed is judged", mavlink="FLT_FORCE")
+    force_n: float = quantity(
+        0.25, unit="N", low=0.05, high=10,
+        help="smallest modelled thruster force at which a propeller that stands still counts as faulty", mavlink="FLT_FORCE"
+    )
     dead_share: float = quantity(
-        0.45, low=0.05, high=0.95, help="share of the believed speed below which a propeller stands", mavlink="FLT_DEAD"
+        0.45, low=0.05, high=0.95, help="share of the expected speed below which a propeller counts as standing still", mavlink="FLT_DEAD"
     )
     dead_count: int = quantity(
-        3, low=1, high=50, help="feedbacks in a row that must agree; the next standstill at 4 force_n counts twice", mavlink="FLT_COUNT"
+        3, low=1, high=50,
+        help="consecutive ESC reports that must agree; a repeated standstill at 4 force_n or more counts twice", mavlink="FLT_COUNT"
     )
     stray_count: int = quantity(
-        2, low=1, high=50, help="the same where it turns too fast or the wrong way, which turns the robot over", mavlink="FLT_STRAY"
+        2, low=1, high=50, help="consecutive ESC reports of overspeed or wrong direction, which can overturn the robot", mavlink="FLT_STRAY"
     )
     lie_share: float = quantity(
-        0.6, low=0.2, high=1.5, help="share of its force that must be missing in the motion", mavlink="FLT_LIE"
+        0.6, low=0.2, high=1.5, help="share of a thruster's force that must be missing from the measured motion", mavlink="FLT_LIE"
     )
-    lie_count: int = quantity(4, low=1, high=50, help="tenths of a second in a row that must agree", mavlink="FLT_LIE_COUNT")
+    lie_count: int = quantity(
+        4, low=1, high=50, help="consecutive blocks of 0.1 s in which force of the same thruster must be missing", mavlink="FLT_LIE_COUNT"
+    )

@@ -18,11 +18,13 @@ class Module:
     """One module: its number on its bus, and its place in its body at the start."""
 
     number: int = quantity(low=1, high=29, help="number on the bus")
-    bus: int = quantity(0, low=0, high=15, help="index into `buses`")
-    vehicle: str = quantity("modcube", help="vehicle name, or a file beside the fleet's")
-    body: int = quantity(-1, low=-1, high=63, help="modules with the same number start docked; -1: alone")
-    cell: np.ndarray = quantity([0, 0, 0], unit="lattice", low=-64, high=64, shape=(3,), help="place in its body")
-    rotation: int = quantity(0, low=0, high=23, help="which of the 24 rotations of the cube (prepare.lattice)")
+    bus: int = quantity(0, low=0, high=15, help="index of the module's bus in `buses`")
+    vehicle: str = quantity("modcube", help="vehicle name, or vehicle file beside the fleet file")
+    body: int = quantity(-1, low=-1, high=63, help="number shared by modules that start docked together; -1: alone")
+    cell: np.ndarray = quantity([0, 0, 0], unit="lattice", low=-64, high=64, shape=(3,), help="lattice cell of the module in its body")
+    rotation: int = quantity(
+        0, low=0, high=23, help="index of the module's rotation, one of the 24 rotations of the cube (prepare.lattice)"
+    )
 
     def __post_init__(self) -> None:
         check_cell(self.cell)
@@ -44,12 +46,12 @@ class Fleet:
     """All modules of one process, in fleet index order."""
 
     module: tuple[Module, ...] = quantity()
-    buses: tuple[str, ...] = quantity(("virtual:modcube",), help="bus of each index")
+    buses: tuple[str, ...] = quantity(("virtual:modcube",), help="CAN buses, in index order")
     rate_hz: int = quantity(100, unit="Hz", low=50, high=400, help="tick rate")
-    pitch_m: float = quantity(0.21, unit="m", low=0.01, high=2.0, help="lattice pitch")
-    latitude_deg: float = quantity(30.2084, unit="deg", low=-90, high=90, help="geodetic origin of the tank")
-    longitude_deg: float = quantity(120.1614, unit="deg", low=-180, high=180, help="geodetic origin of the tank")
-    altitude_m: float = quantity(0.0, unit="m", low=-500, high=9000, help="geodetic origin of the tank")
+    pitch_m: float = quantity(0.21, unit="m", low=0.01, high=2.0, help="lattice pitch: distance between the centres of docked modules")
+    latitude_deg: float = quantity(30.2084, unit="deg", low=-90, high=90, help="geodetic latitude of the tank's origin")
+    longitude_deg: float = quantity(120.1614, unit="deg", low=-180, high=180, help="geodetic longitude of the tank's origin")
+    altitude_m: float = quantity(0.0, unit="m", low=-500, high=9000, help="altitude of the tank's origin")
 
     def __post_init__(self) -> None:
         if not self.module:

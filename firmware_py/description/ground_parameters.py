@@ -15,7 +15,7 @@ class Ground:
         0,
         low=0,
         high=1,
-        help="MANUAL_CONTROL z: 0: 0 to 1000 with 500 in the middle, 1: -1000 to 1000",
+        help="range of MANUAL_CONTROL z; 0: 0 to 1000 with neutral at 500, 1: -1000 to 1000",
         mavlink="STICK_Z",
     )
     setpoint_fresh_s: float = quantity(
@@ -23,7 +23,7 @@ class Ground:
         unit="s",
         low=0.05,
         high=10,
-        help="guided mode needs a set-point not older than this, or it ends",
+        help="timeout of streamed set-points: guided mode neither starts nor continues without a newer one",
         mavlink="GUID_FRESH",
     )
     watch_s: float = quantity(
@@ -31,20 +31,20 @@ class Ground:
         unit="s",
         low=0.5,
         high=600,
-        help="silence after which another ground station may take its place",
+        help="silence of the watched ground station after which another may take its place",
         mavlink="GCS_WATCH",
     )
     mission_speed_m_s: float = quantity(
-        0.15, unit="m/s", low=0.01, high=2, help="of a mission that names no speed", mavlink="MIS_SPEED"
+        0.15, unit="m/s", low=0.01, high=2, help="speed of a mission that specifies no speed", mavlink="MIS_SPEED"
     )
     mission_acceleration: float = quantity(
-        0.10, unit="m/s^2", low=0.01, high=2, help="of a mission, along each axis", mavlink="MIS_ACCEL"
+        0.10, unit="m/s^2", low=0.01, high=2, help="acceleration limit of a mission, along each axis", mavlink="MIS_ACCEL"
     )
     mission_corridor_m: float = quantity(
         0.10,
         unit="m",
         low=0.01,
         high=100,
-        help="distance from the straight line between waypoints",
+        help="largest distance of a mission's path from the straight line between waypoints",
         mavlink="MIS_CORRIDOR",
     )

@@ -20,16 +20,16 @@ class Control:
     """PD gains as bandwidth and damping. The body's mass matrix multiplies them, so one set serves every shape."""
 
     law: str = quantity(
-        "model", choices=("model", "paper"), help="model: desired velocity in drag and Coriolis; paper: measured"
+        "model", choices=("model", "paper"), help="drag and Coriolis terms; model: of the desired velocity, paper: of the measured velocity"
     )
     position_bandwidth: float = quantity(
-        3.45, unit="rad/s", low=0.1, high=10, help="of the position loop", mavlink="POS_BW"
+        3.45, unit="rad/s", low=0.1, high=10, help="bandwidth of the position loop", mavlink="POS_BW"
     )
     position_damping: float = quantity(
         1.16, low=0.1, high=5, help="damping ratio of the position loop", mavlink="POS_DAMP"
     )
     attitude_bandwidth: float = quantity(
-        2.5, unit="rad/s", low=0.1, high=20, help="of the attitude loop", mavlink="ATT_BW"
+        2.5, unit="rad/s", low=0.1, high=20, help="bandwidth of the attitude loop", mavlink="ATT_BW"
     )
     attitude_damping: float = quantity(
         1.18, low=0.1, high=5, help="damping ratio of the attitude loop", mavlink="ATT_DAMP"
@@ -41,7 +41,8 @@ class Control:
         1.0, low=0, high=1, help="share of the estimated disturbance fed forward", mavlink="FF_DIST"
     )
     lead_s: float = quantity(
-        0.09, unit="s", low=0, high=0.5, help="thruster lag and bus delay made up in feed-forward", mavlink="FF_LEAD"
+        0.09, unit="s", low=0, high=0.5,
+        help="lead time of the feed-forward, which compensates thruster lag and bus delay", mavlink="FF_LEAD"
     )
 
 
@@ -50,67 +51,74 @@ class Estimation:
     """Measurement noise of the sensors, and process noise for what the model leaves out."""
 
     kind: str = quantity(
-        "full", choices=("full", "paper"), help="full: tag, IMU, depth, disturbance; paper: tags alone"
+        "full", choices=("full", "paper"), help="full: tags, IMU and depth, with disturbance estimate; paper: tags alone"
     )
     tag_sigma_m: float = quantity(
         0.0021, unit="m", low=1e-5, high=1, help="tag position noise across the camera axis", mavlink="TAG_POS_SD"
     )
     tag_sigma_axis_m: float = quantity(
-        0.0042, unit="m", low=1e-5, high=1, help="along the camera axis", mavlink="TAG_AXIS_SD"
+        0.0042, unit="m", low=1e-5, high=1, help="tag position noise along the camera axis", mavlink="TAG_AXIS_SD"
     )
     tag_sigma_rad: float = quantity(
         0.0096, unit="rad", low=1e-5, high=1, help="tag attitude noise, each axis", mavlink="TAG_ATT_SD"
     )
     tag_gate: float = quantity(
-        5.0, low=4, high=50, help="root of a tag's NIS over all six axes beyond which it is refused; 2.4 is usual", mavlink="TAG_GATE"
+        5.0, low=4, high=50,
+        help="gate: largest accepted root of a tag's NIS over all six axes; 2.4 is typical", mavlink="TAG_GATE"
     )
     gyro_sigma: float = quantity(0.0022, unit="rad/s", low=1e-6, high=1, help="gyro noise per sample", mavlink="GYRO_SD")
     gyro_bias_walk: float = quantity(
         2.2e-5, unit="rad/s/sqrt(s)", low=0, high=1, help="gyro bias random walk", mavlink="GYRO_WALK"
     )
     accel_sigma: float = quantity(
-        0.036, unit="m/s^2", low=1e-4, high=10, help="accelerometer noise, and what its place makes it feel", mavlink="ACC_SD"
+        0.036, unit="m/s^2", low=1e-4, high=10,
+        help="accelerometer noise per sample, including the effect of the mounting position", mavlink="ACC_SD"
     )
     accel_under_way: float = quantity(
         0.33,
         unit="m/s^2/(m/s)",
         low=0,
         high=10,
-        help="what motion adds to that in 10 ms: mass and drag are not as believed",
+        help="accelerometer noise added per speed, for errors of mass and drag, in a sample period of 10 ms",
         mavlink="ACC_SD_WAY",
     )
     accel_bias_walk: float = quantity(
         1e-4, unit="m/s^2/sqrt(s)", low=0, high=1, help="accelerometer bias random walk", mavlink="ACC_WALK"
     )
-    depth_sigma_m: float = quantity(0.003, unit="m", low=1e-5, high=1, help="depth noise", mavlink="DEPTH_SD")
+    depth_sigma_m: float = quantity(0.003, unit="m", low=1e-5, high=1, help="depth noise per sample", mavlink="DEPTH_SD")
     depth_bias_walk: float = quantity(
         2e-4, unit="m/sqrt(s)", low=0, high=1, help="depth bias random walk", mavlink="DEPTH_WALK"
     )
     force_walk: float = quantity(
-        0.0021, unit="m/s^2/sqrt(s)", low=0, high=10, help="disturbance force over mass, of a body at rest", mavlink="DIST_F_WALK"
+        0.0021, unit="m/s^2/sqrt(s)", low=0, high=10,
+        help="random walk of the disturbance force over mass, for a body at rest", mavlink="DIST_F_WALK"
     )
     current_walk: float = quantity(
-        0.086, unit="m/s/sqrt(s)", low=0, high=1, help="water's speed, felt by the drag of a body under way", mavlink="DIST_C_WALK"
+        0.086, unit="m/s/sqrt(s)", low=0, high=1,
+        help="random walk of the water's speed, which acts by drag on a body under way", mavlink="DIST_C_WALK"
     )
     moment_walk: float = quantity(
-        0.035, unit="rad/s^2/sqrt(s)", low=0, high=10, help="disturbance moment over inertia, of a body at rest", mavlink="DIST_M_WALK"
+        0.035, unit="rad/s^2/sqrt(s)", low=0, high=10,
+        help="random walk of the disturbance moment over inertia, for a body at rest", mavlink="DIST_M_WALK"
     )
     righting_walk: float = quantity(
-        0.007, unit="1/sqrt(s)", low=0, high=1, help="trim and righting arm, over what they are off at first", mavlink="DIST_R_WALK"
+        0.007, unit="1/sqrt(s)", low=0, high=1,
+        help="random walk of trim and righting arm, relative to their initial uncertainty", mavlink="DIST_R_WALK"
     )
     accel_process: float = quantity(
-        0.0107, unit="m/s^2/sqrt(Hz)", low=0, high=10, help="white unmodelled acceleration", mavlink="PROC_ACC"
+        0.0107, unit="m/s^2/sqrt(Hz)", low=0, high=10, help="process noise: white unmodelled acceleration", mavlink="PROC_ACC"
     )
     alpha_process: float = quantity(
         0.026,
         unit="rad/s^2/sqrt(Hz)",
         low=0,
         high=10,
-        help="white unmodelled angular acceleration",
+        help="process noise: white unmodelled angular acceleration",
         mavlink="PROC_ALPHA",
     )
     alpha_turning: float = quantity(
-        0.05, unit="rad/s^2/sqrt(Hz)/(rad/s)", low=0, high=10, help="what turning adds to that", mavlink="PROC_ALPHA_W"
+        0.05, unit="rad/s^2/sqrt(Hz)/(rad/s)", low=0, high=10,
+        help="process noise added per turning rate: white unmodelled angular acceleration", mavlink="PROC_ALPHA_W"
     )
 
 
@@ -121,14 +129,14 @@ class Allocation:
     mode: str = quantity(
         "least_squares",
         choices=("least_squares", "least_power", "pseudo_inverse"),
-        help="least_power: by the thrusters' power curves; pseudo_inverse clips, as the paper's",
+        help="least_power: uses the thrusters' power curves; pseudo_inverse: clips, as in the paper",
     )
     preload_n: float = quantity(
         0.6,
         unit="N",
         low=0,
         high=5,
-        help="thrusters pushed against each other to stay clear of the deadband",
+        help="preload of thrusters against each other, to stay clear of the deadband",
         mavlink="PRELOAD",
     )
 
@@ -141,20 +149,20 @@ class Limiter:
         1.0, low=0.05, high=1.0, help="share of each thruster's limit that may be used", mavlink="LIM_FORCE"
     )
     slew_n_per_s: float = quantity(
-        200.0, unit="N/s", low=1, high=1e4, help="fastest change of a thruster's force", mavlink="LIM_SLEW"
+        200.0, unit="N/s", low=1, high=1e4, help="slew rate limit of a thruster's force", mavlink="LIM_SLEW"
     )
     relay_on_s: float = quantity(
-        60.0, unit="s", low=1, high=3600, help="longest time a cold docking magnet stays on", mavlink="LIM_MAG_ON"
+        60.0, unit="s", low=1, high=3600, help="longest time that a cold docking magnet may stay on", mavlink="LIM_MAG_ON"
     )
     relay_duty: float = quantity(
-        1.0, low=0.01, high=1, help="share of time a docking magnet may be on for ever", mavlink="LIM_MAG_DUTY"
+        1.0, low=0.01, high=1, help="largest long-term duty cycle of a docking magnet", mavlink="LIM_MAG_DUTY"
     )
     relay_w: float = quantity(
         6.0,
         unit="W",
         low=0,
         high=1000,
-        help="power that a docking magnet takes from the thrusters",
+        help="power of a docking magnet that is on, subtracted from the power available to thrusters",
         mavlink="LIM_MAG_W",
     )
 
@@ -164,35 +172,36 @@ class Supervision:
     """Limits of arming, end of an e-stop, and re-arming after a restart."""
 
     tag_fresh_ms: float = quantity(
-        500.0, unit="ms", low=10, high=60000, help="a pose older than this is stale", mavlink="TAG_FRESH_MS"
+        500.0, unit="ms", low=10, high=60000,
+        help="age of the newest tag above which the pose is too old to arm with", mavlink="TAG_FRESH_MS"
     )
     arm_sigma_m: float = quantity(
-        0.05, unit="m", low=1e-3, high=10, help="largest position sigma to arm with", mavlink="ARM_SIGMA"
+        0.05, unit="m", low=1e-3, high=10, help="largest standard deviation of the position to arm with", mavlink="ARM_SIGMA"
     )
     answer_ms: float = quantity(
         200.0,
         unit="ms",
         low=5,
         high=5000,
-        help="a module that has not answered for longer is silent",
+        help="timeout after which a module that does not answer counts as silent",
         mavlink="ARM_ANSWER_MS",
     )
     esc_fresh_ms: float = quantity(
-        1000.0, unit="ms", low=50, high=10000, help="ESC feedback older than this is none", mavlink="ARM_ESC_MS"
+        1000.0, unit="ms", low=50, high=10000, help="age above which ESC feedback counts as missing", mavlink="ARM_ESC_MS"
     )
     frame_errors_per_s: float = quantity(
-        20.0, unit="1/s", low=0, high=10000, help="bad frames a second to arm with", mavlink="ARM_FRAME_ERR"
+        20.0, unit="1/s", low=0, high=10000, help="largest rate of bad frames to arm with", mavlink="ARM_FRAME_ERR"
     )
     estop_quiet_ms: float = quantity(
         200.0,
         unit="ms",
         low=200,  # the time that modules themselves wait before they release (docs/mcu.md)
         high=5000,
-        help="an e-stop is over when no frame came for so long",
+        help="time without an e-stop frame after which an e-stop is over",
         mavlink="ESTOP_QUIET_MS",
     )
     rearm: int = quantity(
-        0, low=0, high=1, help="1: after a restart in flight hold at once, 0: wait to be armed", mavlink="REARM"
+        0, low=0, high=1, help="after a restart in flight; 1: arm and hold at once, 0: wait to be armed", mavlink="REARM"
     )
 
 
@@ -201,13 +210,16 @@ class Docking:
     """Docking detector and docking sequence."""
 
     current_threshold_ma: float = quantity(
-        70.0, unit="mA", low=1, high=8000, help="paper: +-70 mA on the face", mavlink="DOCK_MA"
+        70.0, unit="mA", low=1, high=8000,
+        help="magnet current, of either sign, that both docked faces must exceed; paper: 70 mA", mavlink="DOCK_MA"
     )
     current_hysteresis_ma: float = quantity(
-        15.0, unit="mA", low=0, high=1000, help="held down to the threshold less this", mavlink="DOCK_MA_HYST"
+        15.0, unit="mA", low=0, high=1000,
+        help="hysteresis: reduction of the current threshold while the current condition holds", mavlink="DOCK_MA_HYST"
     )
     position_tolerance_m: float = quantity(
-        0.0028, unit="m", low=1e-4, high=0.1, help="relative position off one pitch; less than a jam leaves", mavlink="DOCK_TOL"
+        0.0028, unit="m", low=1e-4, high=0.1,
+        help="largest position error of docked faces, off one pitch; smaller than a jam leaves", mavlink="DOCK_TOL"
     )
     settled_m: float = quantity(
         0.004,
@@ -218,14 +230,15 @@ class Docking:
         mavlink="DOCK_SETTLED",
     )
     hysteresis_m: float = quantity(
-        0.004, unit="m", low=0, high=0.1, help="more is permitted once docked", mavlink="DOCK_HYST"
+        0.004, unit="m", low=0, high=0.1,
+        help="hysteresis: added to position_tolerance_m and settled_m while the position condition holds", mavlink="DOCK_HYST"
     )
     open_m: float = quantity(
         0.02,
         unit="m",
         low=1e-3,
         high=1,
-        help="off one pitch: a joint is open; sound ones read up to 12 mm on the Moebius strip",
+        help="position error above which a joint is open; intact joints show up to 12 mm (Moebius strip)",
         mavlink="DOCK_OPEN",
     )
     debounce_ms: float = quantity(
@@ -233,61 +246,64 @@ class Docking:
         unit="ms",
         low=0,
         high=5000,
-        help="how long a condition is seen before it is believed",
+        help="debounce time of the docking conditions",
         mavlink="DOCK_DEBOUNCE",
     )
     current_fresh_ms: float = quantity(
-        250.0, unit="ms", low=10, high=5000, help="age at which a current no longer counts", mavlink="DOCK_MA_AGE"
+        250.0, unit="ms", low=10, high=5000, help="age above which a magnet current is stale", mavlink="DOCK_MA_AGE"
     )
     pose_fresh_ms: float = quantity(
-        300.0, unit="ms", low=10, high=5000, help="older pictures do not count; a slow camera needs 5 periods", mavlink="DOCK_POSE_AGE"
+        300.0, unit="ms", low=10, high=5000,
+        help="age above which a picture is stale; a slow camera needs 5 of its periods", mavlink="DOCK_POSE_AGE"
     )
     approach: str = quantity(
         "staged",
         choices=("staged", "straight"),
-        help="staged: align at standoff_m first; straight: on one line to the place, which a target that holds comes to meet half way",
+        help="staged: align at standoff_m first; straight: on one line, and a target that holds position meets half-way",
     )
     standoff_m: float = quantity(
         0.12, unit="m", low=0.02, high=2, help="gap at which the bodies are aligned", mavlink="DOCK_STANDOFF"
     )
     align_m: float = quantity(
-        0.004, unit="m", low=1e-4, high=0.1, help="lateral error to begin the approach with", mavlink="DOCK_ALIGN"
+        0.004, unit="m", low=1e-4, high=0.1, help="largest lateral error with which the approach begins", mavlink="DOCK_ALIGN"
     )
     align_rad: float = quantity(
-        0.035, unit="rad", low=1e-3, high=1, help="angle error to begin the approach with", mavlink="DOCK_ALIGN_ANG"
+        0.035, unit="rad", low=1e-3, high=1, help="largest angle error with which the approach begins", mavlink="DOCK_ALIGN_ANG"
     )
     align_s: float = quantity(
-        1.0, unit="s", low=0, high=30, help="how long the alignment must hold", mavlink="DOCK_ALIGN_T"
+        1.0, unit="s", low=0, high=30, help="time that the alignment must hold before the approach begins", mavlink="DOCK_ALIGN_T"
     )
-    speed_m_s: float = quantity(0.04, unit="m/s", low=0.001, high=0.5, help="fastest approach", mavlink="DOCK_SPEED")
+    speed_m_s: float = quantity(0.04, unit="m/s", low=0.001, high=0.5, help="largest approach speed", mavlink="DOCK_SPEED")
     contact_speed_m_s: float = quantity(
-        0.012, unit="m/s", low=0.001, high=0.5, help="approach at contact", mavlink="DOCK_TOUCH"
+        0.012, unit="m/s", low=0.001, high=0.5, help="approach speed at contact", mavlink="DOCK_TOUCH"
     )
     push_s: float = quantity(
         3.0,
         unit="s",
         low=0,
         high=60,
-        help="how long the faces are pushed together before a jam is declared",
+        help="time that the faces are pushed together before a jam is declared",
         mavlink="DOCK_PUSH_T",
     )
     push_m: float = quantity(
-        0.010, unit="m", low=0, high=0.1, help="how far beyond contact the set-point goes", mavlink="DOCK_PUSH"
+        0.010, unit="m", low=0, high=0.1, help="distance beyond contact to which the set-point moves", mavlink="DOCK_PUSH"
     )
     release_s: float = quantity(
         1.0,
         unit="s",
         low=0.01,
         high=60,
-        help="how long the magnets push apart, after a jam and to undock; longer while what comes late may still show a joint closed",
+        help="time that magnets push apart after a jam or to undock; an undock waits longer for late readings",
         mavlink="DOCK_RELEASE",
     )
     sigma_m: float = quantity(
-        0.005, unit="m", low=1e-4, high=0.1, help="relative sigma that aborts", mavlink="DOCK_SIGMA"
+        0.005, unit="m", low=1e-4, high=0.1,
+        help="standard deviation of the relative position above which docking is aborted", mavlink="DOCK_SIGMA"
     )
-    tries: int = quantity(4, low=1, high=20, help="attempts before it gives up", mavlink="DOCK_TRIES")
+    tries: int = quantity(4, low=1, high=20, help="number of attempts before docking fails", mavlink="DOCK_TRIES")
     timeout_s: float = quantity(
-        60.0, unit="s", low=1, high=600, help="longest time in one stage", mavlink="DOCK_TIMEOUT"
+        60.0, unit="s", low=1, high=600,
+        help="timeout of a docking stage, and of waiting for another body in that stage", mavlink="DOCK_TIMEOUT"
     )
 
 

@@ -17,50 +17,53 @@ class Steering:
         0.5, low=0.05, high=1, help="share of the body's force and moment at full stick", mavlink="STICK_SHARE"
     )
     speed_m_s: float = quantity(
-        0.3, unit="m/s", low=0.01, high=3, help="speed at full stick, and to a place", mavlink="NAV_SPEED"
+        0.3, unit="m/s", low=0.01, high=3, help="speed at full stick, and on the way to a position", mavlink="NAV_SPEED"
     )
     rate_rad_s: float = quantity(
-        0.6, unit="rad/s", low=0.01, high=3, help="turning rate at full stick, and to an attitude", mavlink="NAV_RATE"
+        0.6, unit="rad/s", low=0.01, high=3, help="turning rate at full stick, and on the way to an attitude", mavlink="NAV_RATE"
     )
     bandwidth: float = quantity(
-        6.0, unit="rad/s", low=0.5, high=30, help="how fast the set-point takes up a speed", mavlink="NAV_BW"
+        6.0, unit="rad/s", low=0.5, high=30, help="bandwidth with which the set-point takes up a new speed", mavlink="NAV_BW"
     )
     stick_timeout_s: float = quantity(
-        0.5, unit="s", low=0.05, high=10, help="older stick input counts as neutral", mavlink="STICK_TIMEOUT"
+        0.5, unit="s", low=0.05, high=10, help="timeout after which stick input counts as neutral", mavlink="STICK_TIMEOUT"
     )
     stick_dead: float = quantity(
-        0.03, low=0, high=0.5, help="stick deflection that counts as none", mavlink="STICK_DEAD"
+        0.03, low=0, high=0.5, help="deadband: stick deflection up to which an axis counts as neutral", mavlink="STICK_DEAD"
     )
     guided_timeout_s: float = quantity(
-        0.5, unit="s", low=0.05, high=60, help="a set-point without successor stops moving", mavlink="GUID_TIMEOUT"
+        0.5, unit="s", low=0.05, high=60,
+        help="timeout after which a streamed set-point without a successor stops moving", mavlink="GUID_TIMEOUT"
     )
     join_m: float = quantity(
         0.10,
         unit="m",
         low=1e-3,  # rounding limits how near a set-point comes, and a path whose start is never reached does not begin
         high=10,
-        help="start of a trajectory that is farther is approached first",
+        help="distance to the start of a trajectory above which the start is approached first",
         mavlink="AUTO_JOIN",
     )
     join_rad: float = quantity(
-        0.20, unit="rad", low=1e-3, high=3.2, help="the same for its attitude", mavlink="AUTO_JOIN_ANG"
+        0.20, unit="rad", low=1e-3, high=3.2,
+        help="attitude error at the start of a trajectory above which that attitude is taken up first", mavlink="AUTO_JOIN_ANG"
     )
     # Half of the 65 deg up to which the bench's cameras read a tag; at level_rad_s an upside-down module shows its tags within two seconds.
     hold_tilt_rad: float = quantity(
-        0.6, unit="rad", low=0, high=3.2, help="a body that a fail-safe makes hold turns upright if it is steeper", mavlink="HOLD_TILT"
+        0.6, unit="rad", low=0, high=3.2, help="tilt above which a body that a fail-safe makes hold turns upright", mavlink="HOLD_TILT"
     )
     level_rad_s: float = quantity(
-        1.5, unit="rad/s", low=0.01, high=10, help="turning rate of that: until it is upright nobody sees its tags", mavlink="HOLD_LVL_RATE"
+        1.5, unit="rad/s", low=0.01, high=10,
+        help="turning rate of a body that a fail-safe turns upright, to bring its tags back into view", mavlink="HOLD_LVL_RATE"
     )
-    surface_speed_m_s: float = quantity(0.10, unit="m/s", low=0.01, high=2, help="of rising", mavlink="SURF_SPEED")
+    surface_speed_m_s: float = quantity(0.10, unit="m/s", low=0.01, high=2, help="ascent speed in SURFACE", mavlink="SURF_SPEED")
     surface_depth_m: float = quantity(
         0.12, unit="m", low=0, high=10, help="depth of the centre of mass at the surface", mavlink="SURF_DEPTH"
     )
     surface_force_n: float = quantity(
-        3.0, unit="N", low=0, high=1000, help="force per module that lifts while depth is unknown", mavlink="SURF_FORCE"
+        3.0, unit="N", low=0, high=1000, help="upward force per module in SURFACE while depth is unknown", mavlink="SURF_FORCE"
     )
     blend_s: float = quantity(
-        0.3, unit="s", low=0, high=5, help="time over which a mode takes over", mavlink="MODE_BLEND"
+        0.3, unit="s", low=0, high=5, help="time over which the wrench is blended into that of a new mode", mavlink="MODE_BLEND"
     )
     test_share: float = quantity(
         0.3, low=0.01, high=1, help="largest share of full force in a motor test", mavlink="MOT_TEST_MAX"

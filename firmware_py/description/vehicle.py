@@ -44,7 +44,7 @@ class Hull:
     """The outer shape."""
 
     size_m: np.ndarray = quantity(unit="m", low=0.01, high=10.0, shape=(3,), help="edges of the box along x, y, z")
-    mesh: str = quantity("", help="closed mesh (module frame, m) beside the vehicle file, in place of the box")
+    mesh: str = quantity("", help="file of a closed mesh (module frame, m) beside the vehicle file, used in place of the box")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,16 +52,17 @@ class Inertial:
     """Mass properties. A free-flooding module moves entrained and added water besides its own mass."""
 
     dry_kg: float = quantity(unit="kg", low=0.01, high=5000.0, help="mass in air")
-    entrained_kg: float = quantity(0.0, unit="kg", low=0.0, high=5000.0, help="water that moves with the hull")
-    com_m: np.ndarray = quantity([0, 0, 0], unit="m", low=-5, high=5, shape=(3,), help="centre of mass, water included")
+    entrained_kg: float = quantity(0.0, unit="kg", low=0.0, high=5000.0, help="mass of the water that moves with the hull")
+    com_m: np.ndarray = quantity([0, 0, 0], unit="m", low=-5, high=5, shape=(3,), help="centre of mass, entrained water included")
     inertia: np.ndarray = quantity(
-        unit="kg m^2", low=-1e4, high=1e4, shape=(3, 3), help="dry and entrained, about the centre of mass"
+        unit="kg m^2", low=-1e4, high=1e4, shape=(3, 3), help="inertia tensor about the centre of mass, entrained water included"
     )
     added: np.ndarray = quantity(
         [0, 0, 0, 0, 0, 0], unit="kg, kg m^2", low=0, high=1e4, shape=(6,), help=f"diagonal added mass and inertia: {', '.join(AXES)}"
     )
     righting_arm_m: float = quantity(
-        0.0, unit="m", low=-0.5, high=0.5, help="centre of buoyancy above the centre of mass, entrained water included in both"
+        0.0, unit="m", low=-0.5, high=0.5,
+        help="height of the centre of buoyancy above the centre of mass, entrained water included in both"
     )
 
     @property
@@ -83,19 +84,19 @@ class Inertial:
 class Payload:
     """A tool or cargo carried by the module: a solid box, trimmed to be neutrally buoyant with no righting moment."""
 
-    name: str = quantity(help="for people")
+    name: str = quantity(help="name for display")
     dry_kg: float = quantity(unit="kg", low=0.0, high=1000.0, help="mass in air, trim included")
-    entrained_kg: float = quantity(0.0, unit="kg", low=0.0, high=1000.0, help="water that moves with it")
-    size_m: np.ndarray = quantity(unit="m", low=0.001, high=10.0, shape=(3,), help="edges of its box along x, y, z")
-    position_m: np.ndarray = quantity(unit="m", low=-10, high=10, shape=(3,), help="centre of its box and of its mass")
+    entrained_kg: float = quantity(0.0, unit="kg", low=0.0, high=1000.0, help="mass of the water that moves with the payload")
+    size_m: np.ndarray = quantity(unit="m", low=0.001, high=10.0, shape=(3,), help="edges of the payload's box along x, y, z")
+    position_m: np.ndarray = quantity(unit="m", low=-10, high=10, shape=(3,), help="centre of the payload's box and of its mass")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Drag:
     """Coefficients of the drag table: F = -1/2 rho Cd(d) A(d) |v| v."""
 
-    cd_face: float = quantity(unit="", low=0.0, high=5.0, help="drag coefficient of flow normal to a face")
-    cd_edge: float = quantity(unit="", low=0.0, high=5.0, help="drag coefficient of flow onto an edge")
+    cd_face: float = quantity(unit="", low=0.0, high=5.0, help="drag coefficient for flow normal to a face")
+    cd_edge: float = quantity(unit="", low=0.0, high=5.0, help="drag coefficient for flow onto an edge")
     rotational_cd: float = quantity(1.1, low=0.0, high=10.0, help="coefficient of the rotational damping integral")
     linear: np.ndarray = quantity(
         [0, 0, 0, 0, 0, 0], unit="N s/m, N m s", low=0, high=1e4, shape=(6,), help=f"linear damping, diagonal: {', '.join(AXES)}"
@@ -106,7 +107,7 @@ class Drag:
         low=0,
         high=1e5,
         shape=(-1,),
-        help=f"published quadratic damping, in place of areas: {', '.join(AXES)}",
+        help=f"published quadratic damping, used in place of projected areas: {', '.join(AXES)}",
     )
 
 
@@ -117,14 +118,20 @@ class ThrusterCurve:
     force(u) = sum forward[i] u^(i+1) for u > 0, reverse likewise in |u|; power(f) = sum power_w[i] |f|^(i+1).
     """
 
-    voltage_v: float = quantity(unit="V", low=1.0, high=100.0, help="supply at which the curve was taken")
-    forward: np.ndarray = quantity(unit="N", low=-1e4, high=1e4, shape=(5,), help="force over command 0..1")
-    reverse: np.ndarray = quantity(unit="N", low=-1e4, high=1e4, shape=(5,), help="force size over command 0..-1")
-    power_forward: np.ndarray = quantity(unit="W", low=-1e6, high=1e6, shape=(5,), help="power over force size")
-    power_reverse: np.ndarray = quantity(unit="W", low=-1e6, high=1e6, shape=(5,), help="power over force size")
-    deadband_n: float = quantity(0.0, unit="N", low=0.0, high=10.0, help="forces asked below this give none")
-    lag_s: float = quantity(unit="s", low=0.0, high=2.0, help="first-order lag of the force")
-    rpm_at_full: float = quantity(3000.0, unit="1/min", low=1.0, high=1e5, help="speed at command 1")
+    voltage_v: float = quantity(unit="V", low=1.0, high=100.0, help="supply voltage at which the curve was measured")
+    forward: np.ndarray = quantity(unit="N", low=-1e4, high=1e4, shape=(5,), help="polynomial coefficients of force over command, 0 to 1")
+    reverse: np.ndarray = quantity(
+        unit="N", low=-1e4, high=1e4, shape=(5,), help="polynomial coefficients of the magnitude of force over command, 0 to -1"
+    )
+    power_forward: np.ndarray = quantity(
+        unit="W", low=-1e6, high=1e6, shape=(5,), help="polynomial coefficients of power over forward force"
+    )
+    power_reverse: np.ndarray = quantity(
+        unit="W", low=-1e6, high=1e6, shape=(5,), help="polynomial coefficients of power over the magnitude of reverse force"
+    )
+    deadband_n: float = quantity(0.0, unit="N", low=0.0, high=10.0, help="deadband: a smaller demanded force gives none")
+    lag_s: float = quantity(unit="s", low=0.0, high=2.0, help="time constant of the first-order lag of the force")
+    rpm_at_full: float = quantity(3000.0, unit="1/min", low=1.0, high=1e5, help="propeller speed at command 1")
 
     def __post_init__(self) -> None:
         for name in ("forward", "reverse"):
@@ -143,8 +150,10 @@ def _rises(coefficients: np.ndarray, end: float) -> bool:
 class Thruster:
     """Position of a thruster, and the direction in which it pushes the vehicle at a positive command."""
 
-    position_m: np.ndarray = quantity(unit="m", low=-10, high=10, shape=(3,), help="propeller centre")
-    direction: np.ndarray = quantity(low=-1.001, high=1.001, shape=(3,), help="unit vector of positive force")
+    position_m: np.ndarray = quantity(unit="m", low=-10, high=10, shape=(3,), help="centre of the propeller")
+    direction: np.ndarray = quantity(
+        low=-1.001, high=1.001, shape=(3,), help="unit vector of the force on the vehicle at a positive command"
+    )
 
     def __post_init__(self) -> None:
         if abs(float(np.linalg.norm(self.direction)) - 1.0) > 0.01:
@@ -155,9 +164,9 @@ class Thruster:
 class Tag:
     """A fiducial tag. Its frame: z into the face (away from the camera), x and y in the face."""
 
-    id: int = quantity(low=0, high=15, help="number in the TAG frames; the face's number when it sits on a face")
-    position_m: np.ndarray = quantity(unit="m", low=-10, high=10, shape=(3,), help="tag centre")
-    quaternion: np.ndarray = quantity(low=-1, high=1, shape=(4,), help="scalar first, tag frame to module frame")
+    id: int = quantity(low=0, high=15, help="number in the TAG frames; for a tag on a face, the number of the face")
+    position_m: np.ndarray = quantity(unit="m", low=-10, high=10, shape=(3,), help="centre of the tag")
+    quaternion: np.ndarray = quantity(low=-1, high=1, shape=(4,), help="attitude quaternion, scalar first, tag frame to module frame")
 
     def __post_init__(self) -> None:
         if abs(float(np.linalg.norm(self.quaternion)) - 1.0) > 1e-3:
@@ -168,10 +177,10 @@ class Tag:
 class Supply:
     """Battery or tether."""
 
-    voltage_v: float = quantity(12.0, unit="V", low=1.0, high=400.0, help="nominal")
-    current_a: float = quantity(10.0, unit="A", low=0.1, high=1000.0, help="most that it gives")
-    idle_w: float = quantity(8.0, unit="W", low=0.0, high=1000.0, help="drawn by the electronics")
-    magnet_w: float = quantity(6.0, unit="W", low=0.0, high=500.0, help="drawn by one energised docking magnet")
+    voltage_v: float = quantity(12.0, unit="V", low=1.0, high=400.0, help="nominal voltage")
+    current_a: float = quantity(10.0, unit="A", low=0.1, high=1000.0, help="largest current of the supply")
+    idle_w: float = quantity(8.0, unit="W", low=0.0, high=1000.0, help="power drawn by the electronics")
+    magnet_w: float = quantity(6.0, unit="W", low=0.0, high=500.0, help="power drawn by one energised docking magnet")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -179,7 +188,7 @@ class Vehicle:
     """One module: everything that the controller assumes about it."""
 
     name: str = quantity(help="short name")
-    source: str = quantity(help="where the figures come from")
+    source: str = quantity(help="source of the figures")
     hull: Hull = quantity()
     inertial: Inertial = quantity()
     drag: Drag = quantity()
@@ -188,12 +197,12 @@ class Vehicle:
     tag: tuple[Tag, ...] = quantity(())
     supply: Supply = quantity(Supply())
     payload: tuple[Payload, ...] = quantity(())
-    assumption: str = quantity("", help="what is assumed and not measured; shown wherever the vehicle is shown")
-    faces: str = quantity("PDPDPD", help="one letter a face, A to F: P probe, D drogue, - none")
-    force_max_n: float = quantity(unit="N", low=0.1, high=1e4, help="forward limit of each thruster")
-    force_min_n: float = quantity(unit="N", low=-1e4, high=-0.1, help="reverse limit of each thruster")
-    passive_dof: tuple[str, ...] = quantity((), choices=AXES, help="degrees of freedom left to buoyancy")
-    depth_rating_m: float = quantity(50.0, unit="m", low=0.1, high=11000, help="deepest permitted")
+    assumption: str = quantity("", help="what was assumed, not measured; shown wherever the vehicle is shown")
+    faces: str = quantity("PDPDPD", help="type of each face, A to F; P: probe, D: drogue, -: none")
+    force_max_n: float = quantity(unit="N", low=0.1, high=1e4, help="forward force limit of each thruster")
+    force_min_n: float = quantity(unit="N", low=-1e4, high=-0.1, help="reverse force limit of each thruster")
+    passive_dof: tuple[str, ...] = quantity((), choices=AXES, help="degrees of freedom that are left to buoyancy, not controlled")
+    depth_rating_m: float = quantity(50.0, unit="m", low=0.1, high=11000, help="largest permitted depth")
 
     def __post_init__(self) -> None:
         if not self.thruster:

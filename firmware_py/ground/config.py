@@ -17,19 +17,23 @@ class GroundConfig:
 
     links: tuple[str, ...] = quantity(
         ("udpout:127.0.0.1:14550",),
-        help="udpin:, udpout:, tcpin:HOST:PORT, /dev/NAME,BAUD; `+trusted` lets it set the key",
+        help="udpin:, udpout:, tcpin:HOST:PORT, /dev/NAME,BAUD; `+trusted` permits a link to set the signing key",
     )
-    identity: str = quantity("generic", choices=tuple(IDENTITIES), help="generic: PX4's modes; ardusub: ArduSub's")
-    first_system: int = quantity(1, low=1, high=200, help="system id of body 0; body n is that much higher")
+    identity: str = quantity(
+        "generic", choices=tuple(IDENTITIES), help="modes shown to ground stations; generic: PX4's; ardusub: ArduSub's"
+    )
+    first_system: int = quantity(1, low=1, high=200, help="MAVLink system id of body 0; body n has this id plus n")
     watch_system: int = quantity(
-        0, low=0, high=255, help="system id of the ground station that must not be lost; 0: the first"
+        0, low=0, high=255, help="system id of the ground station whose loss counts and which may steer; 0: the first one heard"
     )
-    watch_component: int = quantity(0, low=0, high=255, help="its component id; 0: the first")
-    store: str = quantity("", help="folder of parameters and signing key; empty: nothing is kept")
+    watch_component: int = quantity(
+        0, low=0, high=255, help="component id of the ground station whose loss counts and which may steer; 0: the first one heard"
+    )
+    store: str = quantity("", help="folder for parameters and signing key; empty: nothing is stored")
     dock_button: tuple[int, ...] = quantity(
-        (), low=0, high=63, help="what the dock buttons ask for: module, face, target module and face; empty: nothing"
+        (), low=0, high=63, help="request of the dock buttons: module, face, target module, target face; empty: none"
     )
-    logs: str = quantity("", help="folder of the logs that may be fetched; empty: none")
+    logs: str = quantity("", help="folder of the logs that ground stations may download; empty: none")
 
     def __post_init__(self) -> None:
         if not self.links:

@@ -31,11 +31,15 @@ _SHOWN = 60
 class WaypointTable:
     """One [[waypoint]]."""
 
-    position_m: np.ndarray = quantity(unit="m", low=-1e4, high=1e4, shape=(3,), help="world NED")
-    quaternion: np.ndarray = quantity([], low=-1, high=1, shape=(-1,), help="body to world, scalar first; or none")
-    velocity_m_s: np.ndarray = quantity([], unit="m/s", low=-10, high=10, shape=(-1,), help="to pass with; or none")
-    stop: bool = quantity(False, help="come to rest there")
-    duration_s: float = quantity(0.0, unit="s", low=0.0, high=1e5, help="of the piece that leads there; 0: free")
+    position_m: np.ndarray = quantity(unit="m", low=-1e4, high=1e4, shape=(3,), help="position, world NED")
+    quaternion: np.ndarray = quantity(
+        [], low=-1, high=1, shape=(-1,), help="attitude quaternion, body to world, scalar first; may be left out"
+    )
+    velocity_m_s: np.ndarray = quantity(
+        [], unit="m/s", low=-10, high=10, shape=(-1,), help="velocity at the waypoint, world NED; may be left out"
+    )
+    stop: bool = quantity(False, help="whether the body comes to rest at the waypoint")
+    duration_s: float = quantity(0.0, unit="s", low=0.0, high=1e5, help="duration of the piece that leads to the waypoint; 0: free")
 
     def __post_init__(self) -> None:
         for name, values, length in (("quaternion", self.quaternion, 4), ("velocity_m_s", self.velocity_m_s, 3)):
@@ -49,12 +53,12 @@ class WaypointTable:
 class LimitsTable:
     """[limits]; 0 or an empty list leaves a quantity free."""
 
-    velocity_m_s: np.ndarray = quantity([], unit="m/s", low=1e-3, high=10, shape=(-1,), help="along x, y, z")
-    acceleration_m_s2: np.ndarray = quantity([], unit="m/s^2", low=1e-3, high=10, shape=(-1,), help="along x, y, z")
-    corridor_m: float = quantity(0.0, unit="m", low=0.0, high=100, help="distance from the straight line")
-    angular_rate_rad_s: float = quantity(0.0, unit="rad/s", low=0.0, high=20, help="of the attitude")
-    angular_acceleration_rad_s2: float = quantity(0.0, unit="rad/s^2", low=0.0, high=100, help="of the attitude")
-    thruster_share: float = quantity(0.8, low=0.05, high=1.0, help="of each thruster's force that the path may ask for")
+    velocity_m_s: np.ndarray = quantity([], unit="m/s", low=1e-3, high=10, shape=(-1,), help="velocity limit along x, y, z")
+    acceleration_m_s2: np.ndarray = quantity([], unit="m/s^2", low=1e-3, high=10, shape=(-1,), help="acceleration limit along x, y, z")
+    corridor_m: float = quantity(0.0, unit="m", low=0.0, high=100, help="largest distance from the straight line between waypoints")
+    angular_rate_rad_s: float = quantity(0.0, unit="rad/s", low=0.0, high=20, help="limit of the angular rate")
+    angular_acceleration_rad_s2: float = quantity(0.0, unit="rad/s^2", low=0.0, high=100, help="limit of the angular acceleration")
+    thruster_share: float = quantity(0.8, low=0.05, high=1.0, help="share of each thruster's force that the path may use")
 
     def __post_init__(self) -> None:
         for name, values in (("velocity_m_s", self.velocity_m_s), ("acceleration_m_s2", self.acceleration_m_s2)):
@@ -78,7 +82,7 @@ class Mission:
     """A waypoint file."""
 
     waypoint: tuple[WaypointTable, ...] = quantity()
-    duration_s: float = quantity(0.0, unit="s", low=0.0, high=1e6, help="of the whole; 0: free")
+    duration_s: float = quantity(0.0, unit="s", low=0.0, high=1e6, help="duration of the whole path; 0: free")
     limits: LimitsTable = quantity(LimitsTable())
 
     def __post_init__(self) -> None:

@@ -75,18 +75,20 @@ FRAME_KINDS = tuple(kind for kind, takes in TAKES.items() if takes.directions !=
 class Fault:
     """One fault, active from `at_s` until `until_s`."""
 
-    kind: str = quantity(choices=tuple(TAKES), help="what breaks")
-    at_s: float = quantity(0.0, unit="s", low=0, high=1e6, help="when it begins")
-    until_s: float = quantity(1e6, unit="s", low=0, high=1e6, help="when it is over")
-    module: int = quantity(0, low=0, high=29, help="number of the module; frames: those with its number; 0: all")
-    index: int = quantity(ALL, low=-1, high=15, help="thruster, or face of a magnet; -1: all")
+    kind: str = quantity(choices=tuple(TAKES), help="kind of fault")
+    at_s: float = quantity(0.0, unit="s", low=0, high=1e6, help="time at which the fault begins")
+    until_s: float = quantity(1e6, unit="s", low=0, high=1e6, help="time at which the fault ends")
+    module: int = quantity(
+        0, low=0, high=29, help="number of the affected module; frame faults: frames with that number in their id; 0: all"
+    )
+    index: int = quantity(ALL, low=-1, high=15, help="index of the thruster, or of the face of a magnet; -1: all")
     value: float = quantity(
         0.0, low=-LARGEST, high=LARGEST,
         help="weak, fake_rpm: share of the force that is left; stuck: command; loss, duplicate, corrupt, flip: share; "
-        "delay: ms; babble: frames a tick; jump, camera_bias: m; battery_sag: V less; magnet: -1, 0, 1; jets: strength; "
-        "push: N, from a side of its own in each seed",
+        "delay: ms; babble: frames per tick; jump, camera_bias: m; battery_sag: voltage drop, V; magnet: -1, 0, 1; jets: strength; "
+        "push: N, direction drawn per seed",
     )  # fmt: skip
-    direction: str = quantity("both", choices=DIRECTIONS, help="frames: which way")
+    direction: str = quantity("both", choices=DIRECTIONS, help="frame faults: direction in which frames are affected")
 
     def mistakes(self, thrusters: Mapping[int, int]) -> Iterator[tuple[str, str]]:
         """Yields (key, message) for each value with which the fault would have no effect, or another than described.

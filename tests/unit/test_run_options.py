@@ -68,4 +68,4 @@ def test_help_tells_the_defaults(monkeypatch: pytest.MonkeyPatch, capsys: pytest
 
         main()
     text = capsys.readouterr().out
-    assert all(word in text for word in ("socketcan:can0", "[default: (modcube)]", "[default: (100)]", "not beside --bus"))
+    assert all(word in text for word in ("socketcan:can0", "[default: (modcube)]", "[default: (100)]", "not with --bus"))

@@ -24,16 +24,16 @@ class TrajectoryTable:
     """[trajectory]: one of the closed-form paths of prepare.paths about the origin, rest to rest."""
 
     kind: str = quantity(choices=("spiral", "circle", "moebius", "lissajous"), help="form of the path")
-    duration_s: float = quantity(60.0, unit="s", low=0.1, high=1e5, help="rest to rest")
-    radius_m: float = quantity(0.5, unit="m", low=0.0, high=1e3, help="spiral, circle, moebius")
-    climb_m: float = quantity(0.4, unit="m", low=-1e3, high=1e3, help="spiral: rise from start to end")
-    half_width_m: float = quantity(0.3, unit="m", low=0.0, high=1e3, help="moebius")
-    turns: float = quantity(2.0, low=0.01, high=1e3, help="turns, laps or cycles")
-    amplitude_m: np.ndarray = quantity([0.5, 0.5, 0.2], unit="m", low=0, high=1e3, shape=(3,), help="lissajous")
+    duration_s: float = quantity(60.0, unit="s", low=0.1, high=1e5, help="duration of the path, from rest to rest")
+    radius_m: float = quantity(0.5, unit="m", low=0.0, high=1e3, help="spiral, circle, moebius: radius")
+    climb_m: float = quantity(0.4, unit="m", low=-1e3, high=1e3, help="spiral: height gained from start to end")
+    half_width_m: float = quantity(0.3, unit="m", low=0.0, high=1e3, help="moebius: half-width of the strip")
+    turns: float = quantity(2.0, low=0.01, high=1e3, help="number of turns, laps or cycles")
+    amplitude_m: np.ndarray = quantity([0.5, 0.5, 0.2], unit="m", low=0, high=1e3, shape=(3,), help="lissajous: amplitude along each axis")
     frequency: np.ndarray = quantity(
-        [1.0, 2.0, 3.0], low=0, high=100, shape=(3,), help="lissajous: per turn, each axis"
+        [1.0, 2.0, 3.0], low=0, high=100, shape=(3,), help="lissajous: cycles per turn along each axis"
     )
-    samples: int = quantity(100, low=2, high=10000, help="moments at which the wrench is looked at")
+    samples: int = quantity(100, low=2, high=10000, help="number of points of the path at which the wrench is evaluated")
 
     def path(self) -> Trajectory:
         """The trajectory, world NED."""
@@ -51,12 +51,12 @@ class TrajectoryTable:
 class Task:
     """One task file. The task uses the modules' axes; the pose of the shape in them is free."""
 
-    name: str = quantity(help="for people")
-    vehicle: str = quantity("modcube", help="vehicle name or file of every module")
-    rank_by: str = quantity("margin", choices=RANKINGS, help="what decides")
-    dead: int = quantity(1, low=0, high=4, help="thrusters that may be dead for the guaranteed figures")
-    wrench: np.ndarray = quantity([], unit="N, N m", low=-1e5, high=1e5, shape=(-1, 6), help="held wrenches, body FRD")
-    trajectory: TrajectoryTable | None = quantity(None, help="flown in place of held wrenches")
+    name: str = quantity(help="name for display")
+    vehicle: str = quantity("modcube", help="vehicle name or file, the same for every module")
+    rank_by: str = quantity("margin", choices=RANKINGS, help="figure by which shapes are ranked")
+    dead: int = quantity(1, low=0, high=4, help="number of dead thrusters that the guaranteed figures allow for")
+    wrench: np.ndarray = quantity([], unit="N, N m", low=-1e5, high=1e5, shape=(-1, 6), help="wrenches to hold, body FRD")
+    trajectory: TrajectoryTable | None = quantity(None, help="trajectory to fly, in place of wrenches to hold")
 
     def __post_init__(self) -> None:
         if (self.wrench.size > 0) == (self.trajectory is not None):
