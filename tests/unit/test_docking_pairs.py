@@ -270,15 +270,16 @@ def test_pair_that_jammed_four_millimetres_short_is_not_docked_in_a_minute_of_no
 
 
 def test_locked_pair_is_found_in_noise_and_through_flipped_tags(row: Row) -> None:
-    """One picture in ten shows a flipped tag, whose module would be thirty millimetres off."""
+    """Two pictures in five show a flipped tag, whose module would be fifteen millimetres off."""
     row.noise_m = 0.002
     bank = PairBank(ROW[:1], P)
     for n in range(400):
         time_ns, modules = row.hear()
-        if n % 20 == 0:
+        if n % 10 in (1, 3):
+            assert modules[1].tags
             modules[1].tags = [t._replace(q_wt=multiply(t.q_wt, from_euler(0.3, 0.0, 0.0))) for t in modules[1].tags]
         bank.step(time_ns, modules, ModulePoses(modules, TAGS))
-        assert n < 100 or bank.status(0).docked
+        assert n < 150 or bank.status(0).docked
 
 
 @pytest.mark.parametrize("flip", [(math.pi / 2, 0.0, 0.0), (0.0, math.pi / 2, 0.0), (0.0, 0.0, -math.pi / 2)])
@@ -287,7 +288,8 @@ def test_flipped_tag_that_is_off_by_a_quarter_turn_opens_no_joint(row: Row, flip
     bank = PairBank(ROW[:1], P)
     for n in range(400):
         time_ns, modules = row.hear()
-        if n % 10 == 0:
+        if n % 10 == 1:
+            assert modules[1].tags
             modules[1].tags = [t._replace(q_wt=multiply(t.q_wt, from_euler(*flip))) for t in modules[1].tags]
         bank.step(time_ns, modules, ModulePoses(modules, TAGS))
         assert n < 100 or (bank.status(0).docked and bank.rows["open"][0] == CLOSED)

@@ -224,12 +224,17 @@ def test_e_stop_is_cleared_when_the_bus_has_been_quiet() -> None:
     assert ask(supervisor, Action.CLEAR_ESTOP, None, almost) and supervisor.state == State.DISARMED
 
 
-def test_robot_does_not_arm_while_an_e_stop_was_just_heard() -> None:
-    supervisor = supervisor_in(State.ARMED)
+@pytest.mark.parametrize("forced", [False, True])
+def test_robot_does_not_arm_while_an_e_stop_was_just_heard(forced: bool) -> None:
+    """Neither before the e-stop is cleared, nor by a request that clears it in the same tick."""
+    supervisor, both = supervisor_in(State.ARMED), [Request(Action.CLEAR_ESTOP), Request(Action.ARM, 0, forced)]
     supervisor.step(True, GOOD, [])
-    ask(supervisor, Action.CLEAR_ESTOP, None, at(GOOD, 0.3))
-    supervisor.step(False, at(GOOD, 0.3), [Request(Action.ARM, 0, True)])
-    assert supervisor.armed
+    almost = at(GOOD, 0.2)
+    for health in (GOOD, almost._replace(time_ns=almost.time_ns - 1)):
+        assert supervisor.step(False, health, both) == [] and supervisor.state == State.ESTOP
+        refused = "FORCED_ARM" if forced else "ARM"
+        assert texts(supervisor) == ["CLEAR_ESTOP refused: the e-stop is still raised", f"{refused} refused: not possible in ESTOP"]
+    assert len(supervisor.step(False, almost, both)) == 2 and supervisor.armed
 
 
 # ---------------------------------------------------------------- endings
