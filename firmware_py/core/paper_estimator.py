@@ -126,7 +126,7 @@ class TagOnlyEstimator:
             self._start(p_wb, pose.q_wb, pose.capture_ns)
             return
         turn = log(multiply(conjugate(self._q_wb), pose.q_wb))
-        if float(np.linalg.norm(turn)) > PAPER_FLIP_RAD and self._accepted > READY_AFTER:
+        if float(np.linalg.norm(turn)) > PAPER_FLIP_RAD and self._accepted >= READY_AFTER:
             self._rejected += 1
             self._refused_in_row += 1
             if self._refused_in_row >= RESET_AFTER:

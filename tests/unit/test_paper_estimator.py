@@ -71,12 +71,14 @@ def test_paper_estimator_knows_nothing_of_a_disturbance(body: Body) -> None:
     assert not estimate.force_w.any() and not estimate.moment_b.any()
 
 
-def test_paper_estimator_refuses_flips(body: Body) -> None:
+@pytest.mark.parametrize("before", [READY_AFTER, 50])
+def test_paper_estimator_refuses_flips(before: int, body: Body) -> None:
+    """From the tag on after which it is ready."""
     estimator = TagOnlyEstimator(body, PAPER, PERIOD)
-    for k in range(50):
+    for k in range(before):
         estimator.step(k * PERIOD, seen(k * PERIOD), np.zeros(6))
-    flipped = seen(50 * PERIOD, P_WB, multiply(Q_WB, exp(np.array([0.8, 0.0, 0.0]))))
-    estimate = estimator.step(50 * PERIOD, flipped, np.zeros(6))
+    flipped = seen(before * PERIOD, P_WB, multiply(Q_WB, exp(np.array([0.8, 0.0, 0.0]))))
+    estimate = estimator.step(before * PERIOD, flipped, np.zeros(6))
     assert estimate.rejected == 1
     np.testing.assert_allclose(estimate.p_wb, P_WB, atol=1e-6)
     np.testing.assert_allclose(difference(estimate.q_wb, Q_WB), 0.0, atol=1e-6)
