@@ -118,10 +118,8 @@ class MissingThrust:
             free: no magnet pulls at another body, nor pushes a module of this one away.
         """
         self.acquitted = None
-        if not estimate.ready:
-            return None
         self._add(measured, estimate, force_n)
-        self._free = self._free and free
+        self._free = self._free and free and estimate.ready
         if len(self._seen) < self._ticks:
             return None
         full = self._close(estimate)

@@ -11,7 +11,7 @@ from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
-from tests.unit.robot_in_water import BODY, PUSH, TICK_NS, Water
+from tests.unit.robot_in_water import BODY, PUSH, TICK_NS, ZERO, Water
 
 
 @pytest.fixture
@@ -189,3 +189,19 @@ def test_flow_is_what_a_turn_under_way_meets_and_every_block_has_it() -> None:
     for _ in range(10):
         watch.step(Measured(nu[3:], np.zeros(3), None, []), estimate, np.zeros(8), np.ones(8, bool), True, True)
     np.testing.assert_allclose(watch._blocks[-1, CROSSED:FORCES], out)
+
+
+@pytest.mark.parametrize("ready", [True, False])
+def test_block_in_which_the_pose_was_lost_is_not_judged(ready: bool) -> None:
+    """A robot that begins to turn while its pose is unknown: half of a block is from before, the rest from after."""
+    watch, judged = MissingThrust(BODY, Faults(), TICK_NS), []
+    for tick in range(60):
+        nu = np.r_[0.0, 0.0, 0.0, 0.0, 0.0, 0.01 * min(max(tick - 25, 0), 20)]
+        estimate = Estimate(
+            np.array([0.0, 0.0, 2.0]), from_euler(0.0, 0.0, 0.0), nu, ZERO, ZERO, ZERO, ZERO, 0, 1.0, 6, 0, ready or not 25 <= tick < 45,
+        )  # fmt: skip
+        watch.step(Measured(nu[3:], np.array([0.0, 0.0, -9.80665]), None, []), estimate, np.zeros(8), np.ones(8, bool), True, True)
+        if tick % 10 == 9:
+            judged.append(not np.isnan(watch._blocks[-1, 0]))
+    assert judged == [True, True, ready, ready, ready, True]
+    assert np.nanmax(np.abs(watch._blocks[-6:, 5])) < (0.2 if ready else 0.01)
