@@ -45,7 +45,7 @@ def noise_of(samples: np.ndarray) -> float:
 
 
 def smooth(recording: Recording) -> Motion:
-    """Motion of the centre of mass, by the filter and the backward smoother."""
+    """Motion of the centre of mass, by the filter and the backward smoother; these follow the IMU, whose motion the accelerometer feels."""
     gyro, accel = filled(recording.gyro), filled(recording.accel)
     noise = recording.noise
     density = np.repeat(
@@ -54,7 +54,8 @@ def smooth(recording: Recording) -> Motion:
     density[3:9] *= recording.period_s
     poses = recording.poses
     tags = np.array([[(p.capture_ns - recording.time_ns[0]) * 1e-9 / recording.period_s, p.tags] for p in poses])
-    pictures = np.array([np.concatenate([p.p_wt, p.lever_b, p.q_wb]) for p in poses])
+    lever = recording.body.r_bi[0]
+    pictures = np.array([np.concatenate([p.p_wt, p.lever_b - lever, p.q_wb]) for p in poses])
     variance = np.repeat([noise.tag_sigma_m, noise.tag_sigma_axis_m, noise.tag_sigma_rad], [2, 1, 3]) ** 2
     first = pictures[0]
     start = np.zeros(STATES)
@@ -62,7 +63,9 @@ def smooth(recording: Recording) -> Motion:
     start[:3] = first[:3] - rotate(first[6:10].copy(), first[3:6].copy())
     order = np.argsort(tags[:, 0], kind="stable")
     states = _smooth(start, INITIAL_SIGMA, gyro, accel, recording.period_s, density, tags[order], pictures[order], variance, GATE)
-    return Motion(states[:, :3], states[:, 3:6], states[:, 6:10], gyro - states[:, 10:13])
+    rate, turns = gyro - states[:, 10:13], [to_matrix(q) for q in states[:, 6:10].copy()]
+    away = np.array([r @ np.stack([lever, np.cross(w, lever)], axis=1) for r, w in zip(turns, rate, strict=True)])
+    return Motion(states[:, :3] - away[..., 0], states[:, 3:6] - away[..., 1], states[:, 6:10], rate)
 
 
 def filled(samples: np.ndarray) -> np.ndarray:

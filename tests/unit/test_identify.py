@@ -14,7 +14,10 @@ import identify_quantities as quantities
 import numpy as np
 import pytest
 
-from firmware_py.core.rotations import exp
+from firmware_py.core.observation import GRAVITY
+from firmware_py.core.rotations import exp, rotate, rotate_back
+from firmware_py.core.types import BodyPose
+from firmware_py.description.parameters import Estimation
 from firmware_py.description.schema import DescriptionError, build, frozen_array, read_toml
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import Payload, Vehicle, load_vehicle, vehicle_names
@@ -26,6 +29,30 @@ def test_noise_of_a_sensor_is_found_beside_its_motion() -> None:
     t = np.arange(2000)[:, None] * 0.01
     moved = np.sin(2.0 * t + np.arange(3)) + 0.002 * np.random.default_rng(0).standard_normal((2000, 3))
     assert motion.noise_of(moved) == pytest.approx(0.002, rel=0.05)
+
+
+@pytest.mark.parametrize("at_m", [(0.0, 0.0, 0.0), (0.03, -0.02, 0.04)])
+def test_motion_is_that_of_the_centre_of_mass_wherever_the_imu_is(at_m: tuple[float, float, float]) -> None:
+    """A centre that stands still while the body turns about it; the tags' positions are poor, so the accelerometer counts."""
+    rng, count, lever, tag_at = np.random.default_rng(0), 1500, np.array(at_m), np.array([0.0, 0.0, -0.105])
+    t = 0.01 * np.arange(count)
+    rate, change = np.zeros((2, count, 3))
+    rate[:, 0], change[:, 0] = 1.5 * np.cos(3.0 * t), -4.5 * np.sin(3.0 * t)
+    turns = [exp(np.array([angle, 0.0, 0.0])) for angle in 0.5 * np.sin(3.0 * t)]
+    felt = np.cross(change, lever) + np.cross(rate, np.cross(rate, lever))
+    felt += [rotate_back(q, np.array([0.0, 0.0, -GRAVITY])) for q in turns]
+    poses = [
+        BodyPose(10_000_000 * k, rotate(turns[k], tag_at) + 0.01 * rng.standard_normal(3), tag_at, turns[k], 1)
+        for k in range(0, count, 2)
+    ]  # fmt: skip
+    recording = SimpleNamespace(
+        body=SimpleNamespace(r_bi=lever[None]), period_s=0.01, time_ns=10_000_000 * np.arange(count), poses=poses,
+        gyro=rate + 0.002 * rng.standard_normal((count, 3)), accel=felt + 0.02 * rng.standard_normal((count, 3)),
+        noise=dataclasses.replace(Estimation(), tag_sigma_m=0.01, tag_sigma_axis_m=0.01),
+    )  # fmt: skip
+    found = motion.smooth(recording)
+    assert np.sqrt(np.mean(found.v_w[100:-100] ** 2)) < 0.003
+    assert np.sqrt(np.mean(found.p_wb[100:-100] ** 2)) < 0.003
 
 
 def test_window_sees_a_rate_as_the_slope_of_its_integral() -> None:
