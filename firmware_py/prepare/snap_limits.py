@@ -199,9 +199,10 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
     for _ in range(_ROUNDS):
         try:
             unknown, conflict = problem.solve(table, index, where)
-        except osqp.OSQPException as error:
+        except (osqp.OSQPException, _GaveUpError) as error:
             _, what = worst(limits, system.coefficients(knots.value, start), system.durations)
-            raise InfeasibleError(f"no trajectory was found that keeps the {what}: OSQP gave up with error {error}") from None
+            why = "" if isinstance(error, _GaveUpError) else "error "
+            raise InfeasibleError(f"no trajectory was found that keeps the {what}: OSQP gave up with {why}{error}") from None
         if conflict >= 0:
             what = _sentence(limits[index[conflict]], float(where[conflict]), system.durations)
             raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s keeps the {what}")
@@ -214,6 +215,10 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
     k = int(np.argmax(excess))
     what = _sentence(limits[k], float(crest[k]), system.durations)
     raise InfeasibleError(f"no trajectory was found in {_ROUNDS} rounds that keeps the {what}")
+
+
+class _GaveUpError(Exception):
+    """OSQP stopped without a result; the message is its status."""
 
 
 class _Problem:
@@ -239,7 +244,10 @@ class _Problem:
         return np.ascontiguousarray(unknown.transpose(2, 0, 1)).ravel()
 
     def solve(self, table: _Table, index: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, int]:
-        """(n, 4, 3) solution with rows for planes `index` (r,) at `u` (r,), and -1 or the row most in conflict."""
+        """(n, 4, 3) solution with rows for planes `index` (r,) at `u` (r,), and -1 or the row most in conflict.
+
+        Raises _GaveUpError: there is neither a solution nor a proof that there is none.
+        """
         matrix, constant = self._rows(table, index, u)
         bound = table.bound[index]
         low = -(1.0 - _MARGIN) - (constant - table.centre[index]) / bound
@@ -250,10 +258,11 @@ class _Problem:
         solver.warm_start(x=self._warm)
         with redirect_stdout(io.StringIO()):  # "Polishing not needed" is printed regardless of verbose (osqp/osqp issue 785)
             result = solver.solve(raise_error=False)
-        if result.info.status_val not in (osqp.SolverStatus.OSQP_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE):
-            certificate = result.prim_inf_cert
-            known = certificate is not None and len(certificate) == len(index) and np.all(np.isfinite(certificate))
-            return self._given, int(np.argmax(np.abs(certificate))) if known else 0
+        status = osqp.SolverStatus
+        if result.info.status_val in (status.OSQP_PRIMAL_INFEASIBLE, status.OSQP_PRIMAL_INFEASIBLE_INACCURATE):
+            return self._given, int(np.argmax(np.abs(result.prim_inf_cert)))
+        if result.info.status_val not in (status.OSQP_SOLVED, status.OSQP_SOLVED_INACCURATE):
+            raise _GaveUpError(result.info.status)  # it leaves zeros in the place of a certificate
         self._warm = result.x
         flat = self._flat(self._given)
         flat[self._free] = self._scale * result.x

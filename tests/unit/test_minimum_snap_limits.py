@@ -12,6 +12,7 @@ import pytest
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare import snap_limits
 from firmware_py.prepare.assembly import assemble_vehicle
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, plan
 from firmware_py.prepare.piecewise import Piecewise
@@ -158,6 +159,14 @@ def test_solver_that_gives_up_is_a_limit_that_cannot_be_kept(monkeypatch: pytest
     waypoints = [Waypoint(p) for p in walk(6)]
     with pytest.raises(InfeasibleError, match=r"keeps the velocity along [xyz] within 0.12 m/s .*: OSQP gave up with error 4"):
         plan(waypoints, durations(walk(6)), Limits(velocity=np.full(3, 0.12)), stretch=False)
+
+
+def test_solver_that_runs_out_of_steps_accuses_the_limit_that_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It then proves nothing; the limit along x, which comes first, is never met."""
+    monkeypatch.setitem(snap_limits._SOLVER, "max_iter", 10)
+    waypoints, limits = [Waypoint(p) for p in walk(6)], Limits(velocity=np.array([9.0, 9.0, 0.12]))
+    with pytest.raises(InfeasibleError, match=r"keeps the velocity along z within 0.12 m/s .*: OSQP gave up with maximum iterations"):
+        plan(waypoints, durations(walk(6)), limits, stretch=False)
 
 
 def test_request_that_fits_is_not_stretched(one: Body) -> None:
