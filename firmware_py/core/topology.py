@@ -130,8 +130,8 @@ def _biases(old: Body, x: np.ndarray, new: Body) -> np.ndarray:
 
 
 def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body, shock: Sequence[float]) -> np.ndarray:
-    """(28, 28) covariance of the new body in state x: variances of the old one, increased by the shock; that of the disturbance force is
-    scaled by mass.
+    """(28, 28) covariance of the new body in state x: variances of the old one about the new axes, increased by the shock; that of the
+    disturbance force is scaled by mass.
 
     All correlations but one are dropped. How the acting moment divides into disturbance and righting is unknown for the new body, and
     righting starts with its initial sigma; but their sum, the acting moment, is known as well as before, scaled by inertia.
@@ -140,11 +140,13 @@ def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body, shock: Se
         shock: sigma to add to position m, attitude rad, velocity m/s, rate rad/s.
     """
     variance = old.covariance.diagonal().copy()
+    turn = to_matrix(x[3:7].copy()).T @ to_matrix(old.x[3:7].copy())
+    variance[3:18] = (variance[3:18].reshape(5, 3) @ np.square(turn).T).ravel()
     variance[18:21] *= (after.rigid_mass_kg / before.rigid_mass_kg) ** 2
     variance[:12] += np.repeat(np.array(shock), 3) ** 2
     out = np.diag(variance)
     assert len(out) == ERRORS
-    acts, lean = np.hstack([np.eye(3), skew(down_of(old.x))]), skew(down_of(x))
+    acts, lean = turn @ np.hstack([np.eye(3), skew(down_of(old.x))]), skew(down_of(x))
     grown = (np.trace(after.mass[3:, 3:]) / np.trace(before.mass[3:, 3:])) ** 2
     acting = (acts @ old.covariance[TURNING] @ acts.T).diagonal() * grown
     righting = np.diag(after.righting_sigma**2)

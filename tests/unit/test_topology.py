@@ -225,3 +225,30 @@ def test_joined_body_is_known_no_better_than_the_worse_of_both(two: tuple[Body, 
     joined = join([(target, sure), (active, unsure)], merged)
     assert (joined.accepted, joined.tag_ns) == (3, 1_000)
     assert np.all(joined.covariance.diagonal()[:12] > 1.0)
+
+
+@pytest.mark.parametrize("column", [3, 6, 9, 12, 15])
+def test_what_is_unsure_along_an_axis_stays_so_in_a_body_with_other_axes(
+    column: int, two: tuple[Body, Body, Body, np.ndarray, np.ndarray]
+) -> None:
+    """Attitude, velocity, rate, biases of gyro and accelerometer. A quarter turn about x took the active module's y to the target's z."""
+    _, active, merged, x_t, _ = two
+    sigma = np.full(ERRORS, 1e-3)
+    sigma[column + 2] = 2.0
+    parted = part_of(merged, Motion(x_t, np.diag(sigma**2), 10, 0), active)
+    unsure = rotation(merged.q_bm[1]).inv().apply([0.0, 0.0, 1.0])
+    assert np.argmax(np.abs(unsure)) == 1
+    np.testing.assert_allclose(np.sqrt(parted.covariance.diagonal()[column : column + 3]), 2.0 * np.abs(unsure), atol=0.2)
+
+
+def test_acting_moment_is_unsure_about_the_same_axis_of_a_body_with_other_axes(
+    two: tuple[Body, Body, Body, np.ndarray, np.ndarray]
+) -> None:
+    _, active, merged, x_t, _ = two
+    sigma = np.full(ERRORS, 1e-6)
+    sigma[23] = 1.0
+    parted = part_of(merged, Motion(x_t, np.diag(sigma**2), 10, 0), active)
+    down = rotation(parted.x[3:7]).inv().apply([0.0, 0.0, 1.0])
+    acts = np.hstack([np.eye(3), np.cross(np.eye(3), down)])
+    acting = acts @ parted.covariance[np.ix_(np.r_[21:24, 25:28], np.r_[21:24, 25:28])] @ acts.T
+    assert np.argmax(acting.diagonal()) == 1 and acting[2, 2] < 1e-6
