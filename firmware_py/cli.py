@@ -17,7 +17,7 @@ from typer.exceptions import TyperException
 from firmware_py.bus.port import PortError
 from firmware_py.description.fleet import Fleet, single
 from firmware_py.description.parameters import Parameters, load_parameters
-from firmware_py.description.schema import DescriptionError, meant
+from firmware_py.description.schema import DescriptionError, did_you_mean
 from firmware_py.description.toml_text import explained, to_toml
 from firmware_py.description.vehicle import load_vehicle, vehicle_names
 from firmware_py.ground.config import GroundConfig, check_store, load_ground
@@ -170,7 +170,7 @@ def parameters(
     chosen = load_parameters(file) if file is not None else Parameters()
     groups = [field.name for field in fields(chosen)]
     if unknown := [name for name in group or () if name not in groups]:
-        raise DescriptionError(f"group {unknown[0]!r} is unknown; {meant(unknown[0], groups)}there are {', '.join(groups)}")
+        raise DescriptionError(f"group {unknown[0]!r} is unknown; {did_you_mean(unknown[0], groups)}there are {', '.join(groups)}")
     texts = [f"[{name}]\n{to_toml(getattr(chosen, name), explained)}" for name in groups if name in (group or groups)]
     typer.echo("\n".join(texts), nl=False)
 

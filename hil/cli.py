@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
-from firmware_py.description.schema import DescriptionError, meant
+from firmware_py.description.schema import DescriptionError, did_you_mean
 from firmware_py.runtime.folders import folder_of
 from firmware_py.runtime.interrupts import ended_at_once, interrupted_once
 from firmware_py.runtime.recorder import CAN_LOG
@@ -38,7 +38,7 @@ def parameters_of(controller: str) -> Parameters:
         return load_parameters(Path(controller))
     if controller not in CONTROLLERS:
         known = ", ".join(CONTROLLERS)
-        question = meant(controller, CONTROLLERS)
+        question = did_you_mean(controller, CONTROLLERS)
         raise DescriptionError(f"controller {controller!r} is unknown; {question}there are {known}, or give a .toml file")
     return CONTROLLERS[controller]
 

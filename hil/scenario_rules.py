@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from firmware_py.description.schema import is_file_name, limits_of, meant
+from firmware_py.description.schema import did_you_mean, is_file_name, limits_of
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
@@ -192,7 +192,7 @@ def _in_checks(scenario: Scenario) -> Iterator[Mistake]:
     for i, check in enumerate(scenario.check):
         if check.metric not in names:
             known = f"a run of the kind {scenario.task.kind} has {', '.join(names)}"
-            yield ("check", i, "metric"), f"{check.metric!r} is unknown; {meant(check.metric, names)}{known}"
+            yield ("check", i, "metric"), f"{check.metric!r} is unknown; {did_you_mean(check.metric, names)}{known}"
         first = next(k for k, other in enumerate(scenario.check) if other.metric == check.metric)
         if first < i:
             yield ("check", i, "metric"), f"{check.metric} is checked by another [[check]] already; give low and high in one"

@@ -100,9 +100,9 @@ def measure_flight(seed: int, detailed: bool = False) -> FlightTimes:
 def _watch_stages(watch: Stopwatch, scenario: Scenario) -> list[str]:
     """Wraps the stages of the pipeline and everything else that takes time; returns the labels within pipeline.step."""
     firmware = compose(fleet_of(scenario, "virtual:bench", 100), Parameters())
-    chain = next(each for each in firmware.pipeline.formation.chains if isinstance(each, BodyPipeline))
+    pipeline = next(each for each in firmware.pipeline.formation.pipelines if isinstance(each, BodyPipeline))
     stages = []
-    for name, part in vars(chain).items():
+    for name, part in vars(pipeline).items():
         for method in STAGE_METHODS:
             if callable(getattr(type(part), method, None)) and type(part).__module__.startswith("firmware_py.core"):
                 watch.watch(type(part), method, f"firmware: {name}")

@@ -22,7 +22,7 @@ import numpy as np
 from argument_types import make_room
 from scipy.optimize import nnls
 
-from firmware_py.description.schema import DescriptionError, Source, build, describe, frozen_array, limits_of, meant, read_toml
+from firmware_py.description.schema import DescriptionError, Source, build, describe, did_you_mean, frozen_array, limits_of, read_toml
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 
@@ -79,7 +79,7 @@ def _rows(path: Path) -> list[dict[str, str | None]]:
                     f"{path}:1: no column {', '.join(lacking)}; the header needs command,force_n (and voltage_v, power_w)"
                 )
             for name in header:
-                if name not in (*COLUMNS, *OPTIONAL) and (hint := meant(name, [n for n in OPTIONAL if n not in header])):
+                if name not in (*COLUMNS, *OPTIONAL) and (hint := did_you_mean(name, [n for n in OPTIONAL if n not in header])):
                     raise DescriptionError(f"{path}:1: column '{name}' is unknown; {hint}else give it another name or leave it out")
             rows = list(reader)
     except (UnicodeDecodeError, csv.Error) as error:

@@ -100,7 +100,7 @@ class Loop:
     def __init__(self, modules: int, parameters: Parameters, scale: Scale = NOMINAL, vehicle: str = "modcube") -> None:
         described = load_vehicle(vehicle)
         self.body = body_of(modules, vehicle)
-        self._chain = BodyPipeline(self.body, parameters, PERIOD_NS)
+        self._pipeline = BodyPipeline(self.body, parameters, PERIOD_NS)
         self.aim = HOME
         self._sensors_spec = dataclasses.replace(SensorSpec(), **{**IDEAL, "tag_delay_ms": SensorSpec().tag_delay_ms})
         self._world = _world(self.body, [_scaled(described, scale)] * modules, described.curve.lag_s * scale.lag)
@@ -119,11 +119,11 @@ class Loop:
         tick, self._tick = self._tick, self._tick + 1
         self._push(self._commanded + self.body.thrusters.pinv @ shake)
         inputs = self._sample(tick)
-        chain = self._chain
-        estimate = chain.measure(inputs)
-        thrust = chain.allocator.step(chain.controller.step(self.aim, self.aim, estimate))
-        self._commanded, _ = chain.limiter.step(thrust.force_n, estimate.placed, chain.supply.voltage_v)
-        chain.lag.command(self._commanded)
+        pipeline = self._pipeline
+        estimate = pipeline.measure(inputs)
+        thrust = pipeline.allocator.step(pipeline.controller.step(self.aim, self.aim, estimate))
+        self._commanded, _ = pipeline.limiter.step(thrust.force_n, estimate.placed, pipeline.supply.voltage_v)
+        pipeline.lag.command(self._commanded)
         self._world.advance(PERIOD_NS)
         self._seen += self._camera.watch(self._world)
         self.is_ready = bool(estimate.placed)

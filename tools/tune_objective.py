@@ -14,7 +14,7 @@ import numpy as np
 from loop_response import BODIES, Scale, body_of, margins, measure
 
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.schema import DescriptionError, build, meant, quantity, read_toml, repeated
+from firmware_py.description.schema import DescriptionError, build, did_you_mean, quantity, read_toml, repeated
 from hil.campaign import WALL_CLOCK
 from hil.metrics import SHOWN
 from hil.scenario import Scenario, load_scenario
@@ -105,7 +105,7 @@ class Objective:
             raise DescriptionError(f"parameter {self.search[i].parameter} is searched twice", "search", i, "parameter")
         for i, term in enumerate(self.term):
             if term.metric not in SHOWN:
-                known = meant(term.metric, SHOWN).rstrip() or f"there are {', '.join(SHOWN)}"
+                known = did_you_mean(term.metric, SHOWN).rstrip() or f"there are {', '.join(SHOWN)}"
                 raise DescriptionError(f"metric '{term.metric}' is unknown; {known}", "term", i, "metric")
         if set(self.seeds) & set(self.unseen_seeds):
             raise DescriptionError("a seed is both in seeds and in unseen_seeds; the comparison needs worlds of its own", "unseen_seeds")

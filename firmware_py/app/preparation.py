@@ -58,7 +58,7 @@ def _prepare_part(request: PartRequest, bodies: Bodies, pipeline: Pipeline, vehi
 
 
 def _parting(plan: UndockPlan, pipeline: Pipeline) -> Prepared:
-    return Prepared(plan.opens[0], plan, (pipeline.chain_of(plan.stays), pipeline.chain_of(plan.leaves)))
+    return Prepared(plan.opens[0], plan, (pipeline.body_pipeline_of(plan.stays), pipeline.body_pipeline_of(plan.leaves)))
 
 
 def _prepare_dock(request: DockRequest, bodies: Bodies, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
@@ -71,4 +71,4 @@ def _prepare_dock(request: DockRequest, bodies: Bodies, pipeline: Pipeline, vehi
         plan = plan_dock(request, active, target, vehicles, pitch_m)
     except DescriptionError as error:
         return Prepared(request, None, (), str(error))
-    return Prepared(request, plan, (pipeline.chain_of(plan.merged),))
+    return Prepared(request, plan, (pipeline.body_pipeline_of(plan.merged),))

@@ -21,9 +21,9 @@ acceleration passes this check and tilts the initial attitude, by ten degrees fo
 thrusters, corrects that within seconds."""
 AT_REST_RAD_S = 0.5
 """Largest mean angular rate for a body at rest: in half of the averaging window, 0.1 s, it turns the body by three degrees."""
-SAME_RAD, SAME_M, SAME_M_S, SAME_S = 0.1, 0.1, 1.0, 1.0
+AGREE_RAD, AGREE_M, AGREE_M_S, AGREE_S = 0.1, 0.1, 1.0, 1.0
 """Two tag poses agree if they differ by no more than this in heading (rad), position (m) and time (s). The position limit grows by
-SAME_M_S (m/s) with the time between them, because a body that is assumed to stand still may move that fast. The heading limit is ten times
+AGREE_M_S (m/s) with the time between them, because a body that is assumed to stand still may move that fast. The heading limit is ten times
 a tag's attitude noise; a flipped tag is off by twice the angle at which it is seen."""
 
 
@@ -43,7 +43,7 @@ def upright(gyros: np.ndarray, accels: np.ndarray) -> np.ndarray | None:
     return from_euler(math.atan2(y, z), math.asin(max(-1.0, min(1.0, -x / force))), 0.0)
 
 
-class FirstSight:
+class TagAgreement:
     """Screens tag poses before the position is known: counts the run of those that agree with gravity and with the one before."""
 
     def __init__(self) -> None:
@@ -62,8 +62,8 @@ class FirstSight:
         heading, offset = 2.0 * math.atan2(z, w), pose.p_wt - rotate(pose.q_wb, pose.lever_b) - p_wb
         turned = abs(math.remainder(heading - self._heading, 2.0 * math.pi))  # NaN at first, which agrees with nothing
         gap_s = (pose.capture_ns - self._capture_ns) * 1e-9
-        near = float(np.linalg.norm(offset - self._offset)) <= SAME_M + SAME_M_S * gap_s
-        same = turned <= SAME_RAD and near and gap_s <= SAME_S
+        near = float(np.linalg.norm(offset - self._offset)) <= AGREE_M + AGREE_M_S * gap_s
+        same = turned <= AGREE_RAD and near and gap_s <= AGREE_S
         self.count = self.count + 1 if same else 1
         self._heading, self._offset, self._capture_ns = heading, offset, pose.capture_ns
         return True

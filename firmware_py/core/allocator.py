@@ -18,10 +18,10 @@ from firmware_py.core.least_power import LeastPower
 from firmware_py.core.preload import preload
 from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import module_power
-from firmware_py.core.types import Room, Thrust
+from firmware_py.core.types import Thrust, ThrustLimits
 from firmware_py.description.parameters import Allocation
 
-HOLD = 0.05
+HOLDING_SHARE = 0.05
 """Holding force, which has the same priority as the moment, as a share of what all thrusters together could push. For a module it is 4 N,
 enough against buoyancy, current and the drag of a slow path."""
 PRIORITIES = np.array([1e2, 1e2, 1.0])
@@ -34,7 +34,7 @@ HALVINGS = 8
 """Bisection steps for the share that the supplies can feed; they find it to 0.4 %."""
 TINY = 1e-9
 """Force or moment, N and N m, below which it counts as zero."""
-LEFT = 1e-3
+MAX_RESIDUAL = 1e-3
 """Largest accepted residual of the directions of force and moment, N and N m; a hundred thousand times the usual one."""
 
 
@@ -84,17 +84,17 @@ class Allocator:
         self._most = np.array([np.linalg.norm(body.thrusters.matrix[rows], axis=0) @ reach for rows in (slice(0, 3), slice(3, 6))])
         self._smallest_n = 0.0 if self._clip_only else parameters.preload_n
         self._preloaded: tuple[np.ndarray, np.ndarray] | None = None
-        self._room = Room(body.thrusters.f_min, body.thrusters.f_max, np.full(len(body.modules), np.inf))
+        self._limits = ThrustLimits(body.thrusters.f_min, body.thrusters.f_max, np.full(len(body.modules), np.inf))
         self._set(np.ones(n, dtype=bool), body.thrusters.pinv)
 
     def set_alive(self, alive: np.ndarray) -> None:
         """Sets the thrusters that may be used from now on, (n,) bool."""
         self._set(alive, np.linalg.pinv(self._thrusters.matrix * alive) * alive[:, None])  # exact zeros for unusable thrusters
 
-    def confine(self, room: Room) -> None:
-        """Limits the forces to `room` from now on."""
-        if room is not self._room:
-            self._room = room
+    def confine(self, limits: ThrustLimits) -> None:
+        """Limits the forces to `limits` from now on."""
+        if limits is not self._limits:
+            self._limits = limits
             self._set_limits()
 
     def _set(self, alive: np.ndarray, pinv: np.ndarray) -> None:
@@ -110,7 +110,7 @@ class Allocator:
         self._set_limits()
 
     def _set_limits(self) -> None:
-        self._f_min, self._f_max = self._room.low_n * self._alive, self._room.high_n * self._alive
+        self._f_min, self._f_max = self._limits.low_n * self._alive, self._limits.high_n * self._alive
         self._low, self._high = np.concatenate((self._f_min, np.zeros(3))), np.concatenate((self._f_max, np.ones(3)))
         if self._cheaper:
             self._cheaper.confine(self._f_min, self._f_max)
@@ -137,7 +137,7 @@ class Allocator:
 
     def _parts(self, wrench: np.ndarray) -> np.ndarray:
         """Splits `wrench` into (3, 6): holding force, moment, rest of the force."""
-        held = min(1.0, HOLD * self._most[0] / max(_sizes(wrench)[0], TINY))
+        held = min(1.0, HOLDING_SHARE * self._most[0] / max(_sizes(wrench)[0], TINY))
         parts = np.zeros((3, 6))
         parts[0, :3], parts[1, 3:], parts[2, :3] = held * wrench[:3], wrench[3:], (1.0 - held) * wrench[:3]
         return parts
@@ -145,7 +145,7 @@ class Allocator:
     def _is_fed(self, thrust: Thrust) -> bool:
         """Whether every module's supply is enough. Forces that are NaN pass; the limiter handles them."""
         t = self._thrusters
-        return bool(are_fed(thrust.force_n, t.power_forward, t.power_reverse, t.module, self._room.supply_w))
+        return bool(are_fed(thrust.force_n, t.power_forward, t.power_reverse, t.module, self._limits.supply_w))
 
     def _largest_share(self, wrench: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, Thrust]:
         """Finds the largest share of `wrench` that the supplies can feed together with all of `beside`.
@@ -170,7 +170,7 @@ class Allocator:
         return self._saturated(wrench)
 
     def _thrust(self, force: np.ndarray, kept: tuple[float, float]) -> Thrust:
-        return Thrust(force, self._matrix.dot(force), kept, 1.0 - busiest(force, self._room.low_n, self._room.high_n))
+        return Thrust(force, self._matrix.dot(force), kept, 1.0 - busiest(force, self._limits.low_n, self._limits.high_n))
 
     def _saturated(self, wrench: np.ndarray) -> Thrust:
         """min |f - f_preload|^2 + sum_i w_i (1 - s_i)^2 subject to J f = sum_i s_i W_i, f within limits, 0 <= s_i <= 1; W: `_parts`."""
@@ -178,7 +178,7 @@ class Allocator:
         down = np.array([self._down(part) for part in parts])
         self._rows[-3:] = -parts * down[:, None]
         x = np.empty_like(self._goal)
-        if not nearest(self._rows, self._weights, self._goal, self._low, self._high, x) <= LEFT:
+        if not nearest(self._rows, self._weights, self._goal, self._low, self._high, x) <= MAX_RESIDUAL:
             share = self._common_share(wrench)
             return self._thrust(self._pinv @ wrench * share, (share, share))
         return self._thrust(x[:-3].copy(), _kept((x[-3:] * down) @ parts, wrench))

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-from firmware_py.core.alignment import SAME_S
+from firmware_py.core.alignment import AGREE_S
 from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.transitions import MODES, Need
@@ -155,7 +155,7 @@ def against_arming(question: Question, forced: bool) -> list[str]:
 
 def _seldom(health: Health) -> str:
     """Returns words to add when tags do come, but too far apart to find an unknown position; else empty."""
-    return f": tags come {health.tag_gap_s:.2f} s apart, {SAME_S:.2f} s permitted to tell a place" if health.tag_gap_s > SAME_S else ""
+    return f": tags come {health.tag_gap_s:.2f} s apart, {AGREE_S:.2f} s permitted to tell a place" if health.tag_gap_s > AGREE_S else ""
 
 
 def missing(mode: Mode, health: Health, parameters: Parameters) -> list[str]:

@@ -16,7 +16,7 @@ from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetecto
 from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_sequence import ENDED, DockingSequence, DockPlan, Stage, UndockPlan
 from firmware_py.core.docking_traffic import Dock, Traffic, thirds_of
-from firmware_py.core.docking_way import first_met, obstacle, to_one_place, way_of_piece
+from firmware_py.core.docking_way import first_blocking_module, obstacle, plans_conflict, way_of_piece
 from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.magnet_relays import MagnetRelays
@@ -76,7 +76,7 @@ class DockingStage:
         undocked are left out.
         """
         parting = self._parting
-        return [joint for joint in self._joints.that_are_open(least) if modules_of(joint) not in parting]
+        return [joint for joint in self._joints.open_joints(least) if modules_of(joint) not in parting]
 
     @property
     def _parting(self) -> list[frozenset[int]]:
@@ -118,7 +118,8 @@ class DockingStage:
         An open joint is parted in any mode, in the tick in which its plan arrives: its modules are apart already.
         """
         self.events, decisions = [], Decisions()
-        for undock in [each for each in self._undocks if each.plan.opens[0].module in body.modules and self._joints.left(each.plan.opens)]:
+        mine = [undock for undock in self._undocks if undock.plan.opens[0].module in body.modules]
+        for undock in [each for each in mine if self._joints.existing(each.plan.opens)]:
             self._call_off(undock)
             self._say(WARNING, f"undock of module {undock.plan.opens[0].module} ended: {NO_LONGER}")
         for dock in [each for each in self._docks if each.active == body.index]:
@@ -183,7 +184,7 @@ class DockingStage:
             if under_way is None:
                 self._end(mine, decisions)
         elif isinstance(plan, UndockPlan):
-            self._begin_undock(plan, prepared.chains, time_ns)
+            self._begin_undock(plan, prepared.pipelines, time_ns)
         else:
             if under_way is not None:
                 self._give_up(under_way, ANOTHER, decisions)
@@ -207,12 +208,12 @@ class DockingStage:
             return ANOTHER
         if mine in self._leaders(others):
             return LED
-        if any(to_one_place(plan, dock.sequence.plan) for dock in self._docks if dock.active != mine):
+        if any(plans_conflict(plan, dock.sequence.plan) for dock in self._docks if dock.active != mine):
             return TAKEN
-        comes = self._comes(plan, others, holding)
-        return obstacle(plan, estimates[mine], estimates[others], thirds_of(estimates, mine, others), comes, self._p)
+        target_approaches = self._target_approaches(plan, others, holding)
+        return obstacle(plan, estimates[mine], estimates[others], thirds_of(estimates, mine, others), target_approaches, self._p)
 
-    def _comes(self, plan: DockPlan, target: int, holding: Collection[int]) -> bool:
+    def _target_approaches(self, plan: DockPlan, target: int, holding: Collection[int]) -> bool:
         """Whether the target is to come half the way."""
         taken = any(target in (dock.active, dock.target) for dock in self._docks)
         return (plan.request.both_approach or self._p.approach == "straight") and target in holding and not taken
@@ -237,11 +238,11 @@ class DockingStage:
         if dock.sequence.meets_at_w is not None:
             decisions.returning.append(dock.target)
 
-    def _begin_undock(self, plan: UndockPlan, chains: tuple[Any, ...], time_ns: int) -> None:
+    def _begin_undock(self, plan: UndockPlan, pipelines: tuple[Any, ...], time_ns: int) -> None:
         opens = set(map(modules_of, plan.opens))
         if any(set(map(modules_of, undock.plan.opens)) == opens for undock in self._undocks):
             return
-        self._undocks.append(Undock.begun(plan, chains, time_ns, bool(self._still_closed(plan)), self._p, self._joints))
+        self._undocks.append(Undock.begun(plan, pipelines, time_ns, bool(self._still_closed(plan)), self._p, self._joints))
         self._say(INFORMATION, f"undocking module {plan.opens[0].module} from {plan.opens[0].target_module}")
 
     def _still_closed(self, plan: UndockPlan) -> list[DockRequest]:
@@ -259,12 +260,12 @@ class DockingStage:
     ) -> None:
         request = prepared.request
         active, target = _body_of(request.module, estimates), _body_of(request.target_module, estimates)
-        comes = self._comes(plan, target, holding)
-        sequence = DockingSequence(plan, estimates[active][0], estimates[target][0], self._p, time_ns, comes)
+        target_approaches = self._target_approaches(plan, target, holding)
+        sequence = DockingSequence(plan, estimates[active][0], estimates[target][0], self._p, time_ns, target_approaches)
         pair = FacePair(request.target_module, request.target_face, request.module, request.face, plan.place_t, plan.q_ta)
         at = estimates[active][1]
-        began = REST._replace(p_wb=at.p_wb.copy(), q_wb=at.q_wb.copy())
-        self._docks.append(Dock(sequence, PairDetector(pair, self._p), active, target, prepared, began, set()))
+        start_pose = REST._replace(p_wb=at.p_wb.copy(), q_wb=at.q_wb.copy())
+        self._docks.append(Dock(sequence, PairDetector(pair, self._p), active, target, prepared, start_pose, set()))
         self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
 
     # ------------------------------------------------------------ each tick
@@ -313,8 +314,8 @@ class DockingStage:
         wait = traffic.wait(dock)
         if wait is None:
             return None
-        if wait.words not in dock.said:
-            dock.said.add(wait.words)
+        if wait.words not in dock.reported:
+            dock.reported.add(wait.words)
             self._say(WARNING, f"dock of module {dock.prepared.request.module} {wait.words}")
         return wait.wish
 
@@ -327,7 +328,7 @@ class DockingStage:
     def _join(self, dock: Dock, decisions: Decisions) -> None:
         """Joins two bodies, at most once per tick and body: a second dock finds its bodies gone, and `forget` ends it."""
         if decisions.joining.isdisjoint((dock.active, dock.target)):
-            decisions.joins.append(Join(dock.target, dock.active, dock.prepared.chains[0]))
+            decisions.joins.append(Join(dock.target, dock.active, dock.prepared.pipelines[0]))
             self._docks.remove(dock)
 
     def _release(self, undock: Undock, time_ns: int, estimates: Estimated, decisions: Decisions) -> None:
@@ -356,18 +357,18 @@ class DockingStage:
 
     def _part(self, undock: Undock, whole: int, estimates: Estimated) -> Part:
         """Lets the leaving body glide away; if a third body is in its way, the staying one goes the other way; else neither moves."""
-        (body, at), plan, (stays, leaves) = estimates[whole], undock.plan, undock.chains
+        (body, at), plan, (stays, leaves) = estimates[whole], undock.plan, undock.pipelines
         thirds = thirds_of(estimates, whole) if at.placed else []
         away_w = rotate(at.q_wb, plan.axis_b) * self._p.standoff_m
         for piece, rest, goes, by_w in ((plan.leaves, stays, leaves, away_w), (plan.stays, leaves, stays, -away_w)):
-            if first_met(way_of_piece(plan, piece, body, at, by_w), thirds, self._p) is None:
+            if first_blocking_module(way_of_piece(plan, piece, body, at, by_w), thirds, self._p) is None:
                 return Part(whole, rest, goes, by_w)
         return Part(whole, stays, leaves, np.zeros(3))
 
     def _call_off(self, undock: Undock) -> None:
         """Ends an undock early: magnets pull again where the joint still exists, and go off where another undock has removed it."""
         self._undocks.remove(undock)
-        left = self._joints.left(undock.plan.opens)
+        left = self._joints.existing(undock.plan.opens)
         self.relays.switch(RELAY_OFF, *(joint for joint in undock.plan.opens if joint not in left))
         self.relays.switch(RELAY_PULL, *left)
 

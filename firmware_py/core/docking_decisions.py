@@ -22,7 +22,7 @@ class Prepared(NamedTuple):
 
     request: DockRequest
     plan: DockPlan | UndockPlan | None
-    chains: tuple[Any, ...]
+    pipelines: tuple[Any, ...]
     """Pipelines of the resulting bodies, ready to take over."""
     refusal: str = ""
     """Why there is no plan."""
@@ -34,7 +34,7 @@ class Join(NamedTuple):
     target: int
     """Number of the target body; `active` likewise."""
     active: int
-    chain: Any
+    pipeline: Any
 
 
 class Part(NamedTuple):

@@ -67,7 +67,7 @@ LIMITS = numba.typeof(Limits(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))  # type: ig
 
 
 @njit(numba.void(ROW, numba.int64, numba.boolean, numba.int64, numba.int64), cache=True)
-def _see(row, which, seen, time_ns, after_ns):  # type: ignore[no-untyped-def]
+def _debounce(row, which, seen, time_ns, after_ns):  # type: ignore[no-untyped-def]
     """Debounces a condition: `seen` by a fresh measurement, it is taken over once nothing else was seen for `after_ns`."""
     if seen == (row.holds[which] != 0):
         row.candidate_ns[which] = NEVER_NS
@@ -79,7 +79,7 @@ def _see(row, which, seen, time_ns, after_ns):  # type: ignore[no-untyped-def]
 
 
 @njit(numba.void(ROW, numba.int64), cache=True)
-def _lose(row, which):  # type: ignore[no-untyped-def]
+def _clear_condition(row, which):  # type: ignore[no-untyped-def]
     """Clears a condition that no fresh measurement supports any longer."""
     row.holds[which], row.candidate_ns[which] = 0, NEVER_NS
 
@@ -97,10 +97,10 @@ def _take_currents(row, heard_ma, time_ns, limits):  # type: ignore[no-untyped-d
     weaker = min(abs(row.current_ma[0]), abs(row.current_ma[1]))
     if heard:
         threshold = limits.threshold_ma - (limits.current_hysteresis_ma if row.holds[CURRENT] else 0.0)
-        _see(row, CURRENT, weaker > threshold, time_ns, limits.debounce_ns)
+        _debounce(row, CURRENT, weaker > threshold, time_ns, limits.debounce_ns)
     fresh = time_ns - min(row.current_ns[0], row.current_ns[1]) <= limits.current_fresh_ns
     if not fresh:
-        _lose(row, CURRENT)
+        _clear_condition(row, CURRENT)
     return fresh
 
 
@@ -164,10 +164,10 @@ def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[
             _judge_ring(row, ring)
             slack = limits.position_hysteresis_m if row.holds[POSITION] else 0.0
             near = row.error_m < limits.near_m + slack and row.spread_m < limits.settled_m + slack
-            _see(row, POSITION, near, time_ns, limits.debounce_ns)
+            _debounce(row, POSITION, near, time_ns, limits.debounce_ns)
     fresh = time_ns - row.picture_ns <= limits.pose_fresh_ns
     if not fresh:
-        _lose(row, POSITION)
+        _clear_condition(row, POSITION)
         row.pictures, row.error_m, row.spread_m = 0, math.nan, math.nan
     return fresh
 

@@ -129,10 +129,10 @@ class Steering(NamedTuple):
 class DockingSequence:
     """One dock of one active body to one target body."""
 
-    def __init__(self, plan: DockPlan, active: Body, target: Body, parameters: Docking, time_ns: int, comes: bool) -> None:
-        """`comes`: the target is free to come half the way."""
+    def __init__(self, plan: DockPlan, active: Body, target: Body, parameters: Docking, time_ns: int, target_approaches: bool) -> None:
+        """`target_approaches`: the target is free to come half the way."""
         self.plan = plan
-        self._comes = comes
+        self._target_approaches = target_approaches
         self._p = parameters
         self._r_a, self._q_a = module_in(active, plan.request.module)
         self._r_t, self._q_t = module_in(target, plan.request.target_module)
@@ -170,7 +170,7 @@ class DockingSequence:
             self._enter(Stage.PRE_APPROACH, time_ns)
         speed = self._speed(errors, waits is not None)
         self._gap_m = float(np.clip(self._gap_m + speed * (passed_ns * 1e-9), -self._p.push_m, self._farthest_m))
-        setpoint = self._setpoint(self.met(target), speed, waits)
+        setpoint = self._setpoint(self.target_to_meet(target), speed, waits)
         is_apart = self._gap_m >= self._p.standoff_m
         return Steering(setpoint, TABLE[self.stage].relay, is_apart, None if self.stage in ENDED else meets)
 
@@ -179,7 +179,7 @@ class DockingSequence:
         self.reason = reason
         self._enter(Stage.ABORTED, time_ns)
 
-    def met(self, target: Estimate) -> Estimate:
+    def target_to_meet(self, target: Estimate) -> Estimate:
         """The target estimate to steer for: the current one, or the fixed one of a straight approach."""
         return target if self._fixed is None else self._fixed
 
@@ -205,7 +205,7 @@ class DockingSequence:
         straight = self._p.approach == "straight"
         off, (_, q_t) = self._offset(active, target), pose_of(target, self._r_t, self._q_t)
         left = 0.0 if straight else self._p.standoff_m
-        meets = np.asarray(0.5 * rotate(q_t, off - left * self.plan.axis_t)) if self._comes else None
+        meets = np.asarray(0.5 * rotate(q_t, off - left * self.plan.axis_t)) if self._target_approaches else None
         self.meets_at_w = None if meets is None else target.p_wb + meets
         if straight:
             self._fixed = target._replace(p_wb=target.p_wb + (0.0 if meets is None else meets), nu=np.zeros(6))

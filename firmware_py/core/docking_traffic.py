@@ -10,7 +10,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Estimated, Prepared
 from firmware_py.core.docking_detector import PairDetector
 from firmware_py.core.docking_sequence import DockingSequence, Stage
-from firmware_py.core.docking_way import WAY_SLACK, Way, first_met, way_of_active
+from firmware_py.core.docking_way import WAY_SLACK, Way, first_blocking_module, way_of_active
 from firmware_py.core.setpoint import REST, Wish
 from firmware_py.core.types import Estimate
 from firmware_py.description.parameters import Docking
@@ -28,9 +28,9 @@ class Dock(NamedTuple):
     active: int
     target: int
     prepared: Prepared
-    began: Wish
+    start_pose: Wish
     """Pose of the active body at the start of the dock, to which it returns to give way to others."""
-    said: set[str]
+    reported: set[str]
     """Reasons for waiting that were reported already."""
 
 
@@ -50,7 +50,7 @@ class _Course(NamedTuple):
     thirds: Sequence[tuple[Body, Estimate]]
     slack: float
     """Share of the stand-off, see WAY_SLACK."""
-    met: int | None
+    blocked_by: int | None
     """A module that blocks the way, or the target module while its body is still moving elsewhere; None: the way is free."""
 
 
@@ -76,15 +76,15 @@ class Traffic:
             return ""
         body, at = self._estimates[dock.target]
         way = Way(body, at.p_wb, at.q_wb, to_w, at.q_wb, plan.pitch_m)
-        met = first_met(way, thirds_of(self._estimates, dock.active, dock.target), self._p)
-        return "" if met is None else f"module {met} is where module {plan.request.target_module} comes to meet it"
+        blocker = first_blocking_module(way, thirds_of(self._estimates, dock.active, dock.target), self._p)
+        return "" if blocker is None else f"module {blocker} is where module {plan.request.target_module} comes to meet it"
 
     def wait(self, dock: Dock) -> Wait | None:
         """What the active body does about a third body that blocks its way, or others that wait for it; None: there are none."""
         if dock.active in self._yielding:
-            return Wait(dock.began, "gives way to another")
+            return Wait(dock.start_pose, "gives way to another")
         course = self._courses.get(dock.active)
-        return None if course is None or course.met is None else Wait(REST, f"waits: module {course.met} is on its way")
+        return None if course is None or course.blocked_by is None else Wait(REST, f"waits: module {course.blocked_by} is on its way")
 
     def _course(self, dock: Dock) -> _Course | None:
         """The course of a dock; None if its active body is not travelling, or there is no third body."""
@@ -94,10 +94,11 @@ class Traffic:
             return None
         gap, slack = AHEAD[Stage.APPROACH if self._p.approach == "straight" else sequence.stage]
         body, target_at = self._estimates[dock.target]
-        way = way_of_active(sequence.plan, *self._estimates[dock.active], body, sequence.met(target_at), gap * self._p.standoff_m)
-        comes = dock.target in self._coming and sequence.meets_at_w is None
-        met = sequence.plan.request.target_module if comes else first_met(way, thirds, self._p, slack)
-        return _Course(dock, way, thirds, slack, met)
+        target_at, gap_m = sequence.target_to_meet(target_at), gap * self._p.standoff_m
+        way = way_of_active(sequence.plan, *self._estimates[dock.active], body, target_at, gap_m)
+        target_approaches = dock.target in self._coming and sequence.meets_at_w is None
+        blocker = sequence.plan.request.target_module if target_approaches else first_blocking_module(way, thirds, self._p, slack)
+        return _Course(dock, way, thirds, slack, blocker)
 
     def _yields(self, mine: _Course, before: Sequence[_Course], after: Sequence[_Course]) -> bool:
         """Whether the active body returns to where its dock began. This breaks deadlocks: it does so while it waits itself, or until it
@@ -105,15 +106,15 @@ class Traffic:
 
         It yields only where the way back is free and its old place is out of their ways.
         """
-        body, began = mine.way.body, mine.dock.began
-        stuck = [other for other in after if mine.met in other.way.body.modules and other.dock.active not in self._yielding]
-        waiting = [other for other in (*before, *stuck) if other.met in body.modules]
-        if not waiting or not (mine.met is not None or mine.dock.sequence.makes_room):
+        body, start_pose = mine.way.body, mine.dock.start_pose
+        stuck = [other for other in after if mine.blocked_by in other.way.body.modules and other.dock.active not in self._yielding]
+        waiting = [other for other in (*before, *stuck) if other.blocked_by in body.modules]
+        if not waiting or not (mine.blocked_by is not None or mine.dock.sequence.makes_room):
             return False
-        assert began.p_wb is not None and began.q_wb is not None
-        there = (body, self._estimates[mine.dock.active][1]._replace(p_wb=began.p_wb, q_wb=began.q_wb))
-        is_free = first_met(mine.way._replace(p_end=began.p_wb, q_end=began.q_wb), mine.thirds, self._p) is None
-        return is_free and all(first_met(other.way, [there], self._p, other.slack) is None for other in waiting)
+        assert start_pose.p_wb is not None and start_pose.q_wb is not None
+        there = (body, self._estimates[mine.dock.active][1]._replace(p_wb=start_pose.p_wb, q_wb=start_pose.q_wb))
+        is_free = first_blocking_module(mine.way._replace(p_end=start_pose.p_wb, q_end=start_pose.q_wb), mine.thirds, self._p) is None
+        return is_free and all(first_blocking_module(other.way, [there], self._p, other.slack) is None for other in waiting)
 
 
 def thirds_of(estimates: Estimated, *pair: int) -> list[tuple[Body, Estimate]]:

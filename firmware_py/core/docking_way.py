@@ -104,7 +104,7 @@ def nearest_pass(way: Way, other: Body, other_at: Estimate, slack_m: float, near
     return other.modules[int(np.where(touching, least, np.inf).min(axis=0).argmin())] if touching.any() else None
 
 
-def first_met(way: Way, thirds: Sequence[tuple[Body, Estimate]], p: Docking, slack: float = WAY_SLACK) -> int | None:
+def first_blocking_module(way: Way, thirds: Sequence[tuple[Body, Estimate]], p: Docking, slack: float = WAY_SLACK) -> int | None:
     """A module of a third body that a way comes too near to; None if there is none. Bodies whose place is unknown are left out.
 
     Args:
@@ -119,7 +119,7 @@ def obstacle(
     active: tuple[Body, Estimate],
     target: tuple[Body, Estimate],
     thirds: Sequence[tuple[Body, Estimate]],
-    comes: bool,
+    target_approaches: bool,
     p: Docking,
 ) -> str:
     """Reason why a straight way of the two bodies is blocked. Empty if both ways are free, or the place of either body is unknown, which
@@ -128,21 +128,21 @@ def obstacle(
     The target itself is no obstacle to the paper's straight approach, which leads through it from wherever it begins.
 
     Args:
-        comes: the target comes to meet the active body.
+        target_approaches: the target comes to meet the active body.
     """
     if not (active[1].placed and target[1].placed):
         return ""
     staged = p.approach == "staged"
     way = way_of_active(plan, *active, *target, p.standoff_m if staged else 0.0)
-    met = nearest_pass(way, *target, WAY_SLACK * p.standoff_m) if staged else None
-    met = first_met(way, thirds, p) if met is None else met
-    if met is not None:
-        return f"on its way it would come too near to module {met}: bring it before that face first"
-    met = first_met(way_of_target(plan, way, *target), thirds, p) if comes else None
-    return "" if met is None else f"module {plan.request.target_module}, which is to meet it, would come too near to module {met}"
+    blocker = nearest_pass(way, *target, WAY_SLACK * p.standoff_m) if staged else None
+    blocker = first_blocking_module(way, thirds, p) if blocker is None else blocker
+    if blocker is not None:
+        return f"on its way it would come too near to module {blocker}: bring it before that face first"
+    blocker = first_blocking_module(way_of_target(plan, way, *target), thirds, p) if target_approaches else None
+    return "" if blocker is None else f"module {plan.request.target_module}, which is to meet it, would come too near to module {blocker}"
 
 
-def to_one_place(plan: DockPlan, other: DockPlan) -> bool:
+def plans_conflict(plan: DockPlan, other: DockPlan) -> bool:
     """Whether both docks would bring a module to the same place, relative to a body that both include."""
     common = set(plan.merged.modules).intersection(other.merged.modules)
     if not common:

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core import observation
-from firmware_py.core.alignment import FirstSight, upright
+from firmware_py.core.alignment import TagAgreement, upright
 from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.history import WINDOW_NS, History
 from firmware_py.core.propagation import ERRORS, STATES
@@ -35,8 +35,8 @@ READY_AFTER = 10
 UNKNOWN_SIGMA = np.full(6, 1e3)
 """Sigma of the pose before the first tag, m and rad."""
 UPRIGHT_AFTER_S = 1.0
-"""Time without a tag after which the attitude is taken from gravity: the mean specific force of the last `FELT_NS`."""
-FELT_NS = 200_000_000
+"""Time without a tag after which the attitude is taken from gravity: the mean specific force of the last `GRAVITY_WINDOW_NS`."""
+GRAVITY_WINDOW_NS = 200_000_000
 BLIND_NS = 250_000_000
 """Time without a tag, fifteen pictures, after which the head leaves the anchor; also the time without a depth reading after which depth
 counts as unmeasured."""
@@ -50,10 +50,10 @@ STILL_DENSITY = 0.0003
 NORTH_DENSITY = 1e-4
 """Noise density of the heading pseudo-measurement before the first tag, rad^2 s. Until then the believed heading defines north, so it is
 known by definition. Without this the filter fitted the heading to noise: a bump turned the estimate by a third of a circle."""
-KEPT, MOVING, GYROS = np.r_[10:19, 21:25, 26:29], slice(6, 9), slice(12, 15)
-"""Entries that matter when tags relocate a body that was adrift. KEPT (state): angular rates, biases, vertical force, moment and righting
-vector, which do not depend on the heading, survive. MOVING (error): velocity, whose covariance is set from `SPEED_SIGMA`. GYROS (error):
-gyro biases, whose covariance stays: with a larger variance the filter would take the next unmodelled bump for a bias."""
+KEPT_STATES, VELOCITY_ERRORS, GYRO_BIAS_ERRORS = np.r_[10:19, 21:25, 26:29], slice(6, 9), slice(12, 15)
+"""Entries that matter when tags relocate a body that was adrift. KEPT_STATES: angular rates, biases, vertical force, moment and righting
+vector, which do not depend on the heading, survive. VELOCITY_ERRORS: their covariance is set from `SPEED_SIGMA`. GYRO_BIAS_ERRORS: their
+covariance stays: with a larger variance the filter would take the next unmodelled bump for a bias."""
 WAY_S = 0.01
 """Sample period for which `accel_under_way` gives the error of one sample. A wrong mass causes the same error in all samples within that
 time, so that more samples carry no more information."""
@@ -63,7 +63,7 @@ filter restarts because it refused too many tags. A wrong position does not spoi
 why tags were refused. Biases and vertical force are not kept: while tags are refused, they absorb whatever does not fit."""
 SPEED_SIGMA = 0.5
 """Sigma of the velocity of a body that was adrift, when tags relocate it, m/s: the speed of a module at half stick."""
-FELT_LIMIT_NS = 2_000_000_000
+NO_ACCEL_LIMIT_NS = 2_000_000_000
 """Time without an accelerometer after which a body that is adrift loses its attitude too: four times the delay of the fail-safe
 `imu_lost`."""
 RESET_AFTER = 30
@@ -96,8 +96,8 @@ class Estimator:
         self.retune(parameters)
         self._refused_in_row = 0
         self._rejected = 0
-        self._last_tag_ns, self._taken_ns = NEVER_NS, 0
-        self._first_sight, self._felt_ns, self._depth_ns = FirstSight(), 0, 0
+        self._last_tag_ns, self._last_accept_ns = NEVER_NS, 0
+        self._tag_agreement, self._last_accel_ns, self._last_depth_ns = TagAgreement(), 0, 0
         self._nis = math.nan
         self._nis_dof = 0
 
@@ -131,8 +131,8 @@ class Estimator:
         if self._history.newest >= 0 and time_ns - self._history.newest_ns > WINDOW_NS:
             self._accepted = self._waited = 0  # the process was suspended: the history does not reach back to the anchor
         self._history.push(time_ns, tau, measured.gyro, measured.accel, measured.depth_m)
-        self._felt_ns = time_ns if measured.accel is not None else self._felt_ns
-        self._depth_ns = time_ns if measured.depth_m is not None else self._depth_ns
+        self._last_accel_ns = time_ns if measured.accel is not None else self._last_accel_ns
+        self._last_depth_ns = time_ns if measured.depth_m is not None else self._last_depth_ns
         for pose in measured.tags:
             self._take(pose)
         if self._is_lost(time_ns):
@@ -157,8 +157,8 @@ class Estimator:
         self._history.push(time_ns, np.zeros(6), None, None, None)
         self._anchor = self._head = Belief(motion.x.copy(), motion.covariance.copy(), time_ns)
         self._now = self._anchor.x
-        self._felt_ns = self._depth_ns = time_ns
-        self._last_tag_ns, self._taken_ns = motion.tag_ns, time_ns
+        self._last_accel_ns = self._last_depth_ns = time_ns
+        self._last_tag_ns, self._last_accept_ns = motion.tag_ns, time_ns
         self._accepted, self._refused_in_row = motion.accepted, 0
         self._nis, self._nis_dof = math.nan, 0
         return self._estimate(time_ns)
@@ -188,7 +188,7 @@ class Estimator:
         sigma = np.r_[np.repeat(np.array(INITIAL_SIGMA), [3, 3, 3, 3, 3, 3, 3, 3, 1]), self._body.righting_sigma]
         sigma[18:24] *= inertia
         self._anchor = self._head = Belief(x, np.diag(sigma**2), pose.capture_ns)
-        self._last_tag_ns, self._taken_ns = pose.capture_ns, self._history.newest_ns
+        self._last_tag_ns, self._last_accept_ns = pose.capture_ns, self._history.newest_ns
         self._accepted, self._refused_in_row = 1, 0
         self._now = x
 
@@ -197,7 +197,7 @@ class Estimator:
         self._waited += 1
         if self._waited * self._dt <= UPRIGHT_AFTER_S:
             return
-        _, gyros, others = self._history.since(self._history.first_after(time_ns - FELT_NS))
+        _, gyros, others = self._history.since(self._history.first_after(time_ns - GRAVITY_WINDOW_NS))
         tilt = upright(gyros, others[:, :3])
         if tilt is None:
             return
@@ -219,32 +219,32 @@ class Estimator:
 
     def _is_lost(self, time_ns: int) -> bool:
         """Whether the estimate rests on too little: on a few tags after which no more came, or for long on nothing but a gyro."""
-        few = self._accepted < READY_AFTER and time_ns - self._taken_ns > UPRIGHT_AFTER_S * 1e9
-        borne_out_ns = max(self._felt_ns, self._last_tag_ns + ADRIFT_NS)
-        return self._accepted > 0 and (few or time_ns - borne_out_ns > FELT_LIMIT_NS)
+        few = self._accepted < READY_AFTER and time_ns - self._last_accept_ns > UPRIGHT_AFTER_S * 1e9
+        borne_out_ns = max(self._last_accel_ns, self._last_tag_ns + ADRIFT_NS)
+        return self._accepted > 0 and (few or time_ns - borne_out_ns > NO_ACCEL_LIMIT_NS)
 
     def _stilled(self, at: Belief) -> Belief:
         """Fuses a zero velocity over ground, with noise, as a pseudo-measurement (see ADRIFT_NS); ArduPilot's EKF3 does likewise without
         aiding. Includes the vertical velocity only while depth is unmeasured. Before the first tag, fuses the believed heading too.
         """
-        axes = 2 if self._history.newest_ns - self._depth_ns < BLIND_NS else 3
+        axes = 2 if self._history.newest_ns - self._last_depth_ns < BLIND_NS else 3
         north = math.inf if self._has_north else NORTH_DENSITY / self._dt
         x, covariance = observation.fuse_stillness(at.x, at.covariance, STILL_DENSITY / self._dt, axes, north)
         return Belief(x, covariance, at.time_ns)
 
     def _place(self, pose: BodyPose) -> None:
-        """Relocates a body that was adrift once enough tags agree (`FirstSight`); the state entries KEPT stay."""
-        if not self._first_sight.agrees(pose, self._anchor.x[:3], self._anchor.x[3:7]):
+        """Relocates a body that was adrift once enough tags agree (`TagAgreement`); the state entries KEPT_STATES stay."""
+        if not self._tag_agreement.agrees(pose, self._anchor.x[:3], self._anchor.x[3:7]):
             self._refuse(pose)
             return
         self._refused_in_row = 0
-        if self._first_sight.count >= READY_AFTER:
+        if self._tag_agreement.count >= READY_AFTER:
             before, had_north = self._anchor, self._has_north
             self._start(pose)
-            self._anchor.x[KEPT], self._accepted = before.x[KEPT], READY_AFTER
-            self._anchor.covariance[MOVING, MOVING] = SPEED_SIGMA**2 * np.eye(3)
+            self._anchor.x[KEPT_STATES], self._accepted = before.x[KEPT_STATES], READY_AFTER
+            self._anchor.covariance[VELOCITY_ERRORS, VELOCITY_ERRORS] = SPEED_SIGMA**2 * np.eye(3)
             if had_north:  # before the first tag the assumed heading makes their variance too small
-                self._anchor.covariance[GYROS, GYROS] = before.covariance[GYROS, GYROS]
+                self._anchor.covariance[GYRO_BIAS_ERRORS, GYRO_BIAS_ERRORS] = before.covariance[GYRO_BIAS_ERRORS, GYRO_BIAS_ERRORS]
 
     def _advanced(self, start: Belief, to_ns: int) -> Belief:
         """Returns the belief advanced to `to_ns`, with the inertial and depth measurements on the way fused."""
@@ -274,7 +274,7 @@ class Estimator:
         self._nis_dof += 6
         self._accepted += 1
         self._refused_in_row = 0
-        self._last_tag_ns, self._taken_ns = pose.capture_ns, self._history.newest_ns
+        self._last_tag_ns, self._last_accept_ns = pose.capture_ns, self._history.newest_ns
 
     def _refuse(self, pose: BodyPose) -> None:
         self._rejected += 1
@@ -289,7 +289,7 @@ class Estimator:
 
     def _lead(self, time_ns: int) -> None:
         """Moves the head: equal to the anchor while tags come; otherwise it runs ahead, up to one period before now."""
-        if time_ns - self._taken_ns < BLIND_NS:
+        if time_ns - self._last_accept_ns < BLIND_NS:
             self._head = self._anchor
             return
         start = max(self._head, self._anchor, key=lambda belief: belief.time_ns)

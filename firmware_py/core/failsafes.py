@@ -93,7 +93,7 @@ TABLE = (
     Row("battery_unknown", "no reading of a battery for {:.1f} s", "battery_age_s"),
     Row("battery_low", "battery low: {:.0%} of its voltage", "voltage_share", below=True),
 )
-FIGURES = attrgetter(*(row.figure for row in TABLE))
+get_figures = attrgetter(*(row.figure for row in TABLE))
 """Returns the figure of every row, from the health of a tick."""
 
 
@@ -209,7 +209,7 @@ class Failsafes:
             forced: whether a fail-safe and not a person chose `mode`.
         """
         alarms = []
-        for watch, value in zip(self._all, FIGURES(health), strict=True):
+        for watch, value in zip(self._all, get_figures(health), strict=True):
             cause = (value < watch.limit if watch.row.below else value > watch.limit) and watch.counts(mode, forced, armed)
             if not cause and not watch.active and watch._since_ns is None:
                 continue
@@ -234,7 +234,7 @@ class Failsafes:
         """Returns the active fail-safes above a warning, in words."""
         return [watch.reason(health) for watch in self._all if watch.active and watch.level > Level.WARN]
 
-    def against(self, mode: Mode, health: Health, but: Container[str] = ()) -> list[str]:
+    def reasons_against(self, mode: Mode, health: Health, but: Container[str] = ()) -> list[str]:
         """Returns the reasons against entering `mode` now, in words; empty when it may be entered. Rows named in `but` are ignored."""
         return [
             watch.reason(health)

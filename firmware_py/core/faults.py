@@ -25,7 +25,7 @@ from firmware_py.description.failsafe_parameters import Faults
 ESC_DOWN = (1, 3)
 """EscStatus FAULT and SILENT."""
 WHY = ("has an ESC that failed", "stands still", "does not obey")
-DOWN, STANDS, DISOBEYS = range(len(WHY))
+ESC_FAILED, STALLED, WRONG_SPEED = range(len(WHY))
 """Faults that enough ESC feedbacks in a row may show, gravest first."""
 NEITHER = (-1, -1)
 """Thruster indices for a feedback of ESCs that the vehicle does not have."""
@@ -43,7 +43,7 @@ SILENT_NS = 500_000_000
 """Silence after which a module's thrusters are excluded, if the others can make every wrench without them; the fail-safe `module_silent`
 acts then too. A module that hears nothing either has stopped its thrusters after 100 ms (DESIGN's bus); one that still hears stops them
 because of the exclusion."""
-TELLS = 0.3
+FEEDBACK_WEIGHT = 0.3
 """Weight of one ESC feedback in the running share of force that a thruster reports. Ten come per second (DESIGN's bus), which gives a
 memory of 0.3 s: less than the half second of motion that core.missing_thrust judges."""
 
@@ -112,7 +112,7 @@ class FaultDetector:
         """Messages of this tick, for people."""
         self.changed = False
         """Whether `now` changed in this tick."""
-        self.now = self._judge(self._obeys)
+        self.now = self._state_for(self._obeys)
 
     def retune(self, parameters: Faults) -> None:
         """Applies new limits from this tick on; known faults stay."""
@@ -128,7 +128,7 @@ class FaultDetector:
                 self._mute += [i] if j in other._mute else []
                 for channel, thruster in self._thruster_at[i].items():
                     self._obeys[thruster] = other._obeys[other._thruster_at[j][channel]]
-        self.now = self._left()
+        self.now = self._usable_state()
 
     def reset(self) -> None:
         """Trusts all thrusters again."""
@@ -136,7 +136,7 @@ class FaultDetector:
         self._motion.reset()
         self.changed = not self.now.alive.all()
         self._obeys[:], self._mute = True, []
-        self.now = self._judge(self._obeys)
+        self.now = self._state_for(self._obeys)
 
     def step(
         self,
@@ -180,7 +180,7 @@ class FaultDetector:
         self._mute = quiet if armed else []
         if self._mute == before:
             return
-        alive, self.now = self.now.alive, self._left()
+        alive, self.now = self.now.alive, self._usable_state()
         if not np.array_equal(alive, self.now.alive):
             self.changed = True
             self._motion.forget()
@@ -188,12 +188,12 @@ class FaultDetector:
             less = bool((self.now.alive < self._obeys).any())
             self.words.append(f"thrusters of silent module {silent} are left out" if less else "thrusters of every module are used again")
 
-    def _left(self) -> ThrusterFaults:
+    def _usable_state(self) -> ThrusterFaults:
         """Returns the fault state: all thrusters that obey, without those of silent modules where the others have the same rank."""
-        obeying = self._judge(self._obeys)
+        obeying = self._state_for(self._obeys)
         if not self._mute:
             return obeying
-        heard = self._judge(self._obeys & ~np.isin(self._t.module, self._mute))
+        heard = self._state_for(self._obeys & ~np.isin(self._t.module, self._mute))
         return heard._replace(dead=obeying.dead) if heard.lost_axes == obeying.lost_axes else obeying
 
     def _hear(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
@@ -207,7 +207,8 @@ class FaultDetector:
         if not heard:
             return
         feedback = np.array(heard, dtype=np.float64).reshape(-1, 3, 2)
-        if judge(feedback, force_n, self.now.alive, *self._believed, *self._limits, self._needed, self._counts, self._heard, self._share):
+        limits = (*self._limits, self._needed)
+        if count_feedback(feedback, force_n, self.now.alive, *self._believed, *limits, self._counts, self._heard, self._share):
             for i, kind in np.argwhere(self._counts >= self._needed).tolist():
                 if self.now.alive[i]:
                     self._lose(i, WHY[kind])
@@ -223,8 +224,8 @@ class FaultDetector:
     def _watch_at_rest(self, i: int, rpm: float, force_n: np.ndarray) -> None:
         """Judges one feedback while disarmed. The limit follows the believed force, as a propeller runs down after a flight."""
         most = FAST_SHARE * abs(self.believed_rpm(i, force_n[i])) + FAST_MARGIN * self._believed[1][i]
-        self._counts[i, DISOBEYS] = self._counts[i, DISOBEYS] + 1 if abs(rpm) > most else 0
-        if self._counts[i, DISOBEYS] == self._needed[DISOBEYS]:
+        self._counts[i, WRONG_SPEED] = self._counts[i, WRONG_SPEED] + 1 if abs(rpm) > most else 0
+        if self._counts[i, WRONG_SPEED] == self._needed[WRONG_SPEED]:
             self.words.append(f"thruster {i + 1} turns though it was told to stand still")
 
     def believed_rpm(self, i: int, force_n: float) -> float:
@@ -234,18 +235,18 @@ class FaultDetector:
 
     def _lose(self, i: int, why: str) -> None:
         self._obeys[i] = False
-        self.now, self.changed = self._left(), True
+        self.now, self.changed = self._usable_state(), True
         self._motion.forget()
         self.words.append(f"thruster {i + 1} {why}: left out")
 
     def _take_back(self, i: int) -> None:
         """Uses a thruster again that the motion alone had convicted."""
         self._obeys[i] = True
-        self.now, self.changed = self._left(), True
+        self.now, self.changed = self._usable_state(), True
         self._motion.forget()
         self.words.append(f"thruster {i + 1} is used again: the robot is pushed as much without it")
 
-    def _judge(self, usable: np.ndarray) -> ThrusterFaults:
+    def _state_for(self, usable: np.ndarray) -> ThrusterFaults:
         alive = usable.copy()
         u, values, _ = np.linalg.svd(self._t.matrix * alive, full_matrices=alive.size < 6)  # u is (6, 6) even with fewer thrusters
         rank = int(np.sum(values > RANK_TOLERANCE * max(float(values[0]), 1e-12)))
@@ -260,15 +261,15 @@ def believed_rpm(force_n, full_n, rpm_at_full):  # type: ignore[no-untyped-def]
 
 
 @njit(f"boolean(float64[:,:,::1],{V},boolean[::1],{M},{V},float64,float64,int64[::1],int64[:,::1],{M},{V})", cache=True)
-def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, needed, counts, heard, share):  # type: ignore[no-untyped-def]
+def count_feedback(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, needed, counts, heard, share):  # type: ignore[no-untyped-def]
     """Updates fault counts and force shares from ESC feedback; returns whether any thruster has shown a fault often enough.
 
     Args:
         feedback: (k, 3, 2) per frame the indices (-1: none), speeds 1/min and EscStatus of its two thrusters.
         force_n, alive, full_n, rpm_at_full: per thruster believed force, whether usable, full forces (n, 2), full speed.
         least_n: smallest believed force at which a standstill is judged, N; dead_share: the parameter.
-        needed: (3,) feedbacks in a row that suffice for DOWN, STANDS, DISOBEYS.
-        counts: (n, 3) feedbacks in a row that showed DOWN, STANDS, DISOBEYS; a clear STANDS after another one counts twice.
+        needed: (3,) feedbacks in a row that suffice for ESC_FAILED, STALLED, WRONG_SPEED.
+        counts: (n, 3) feedbacks in a row that showed ESC_FAILED, STALLED, WRONG_SPEED; a clear STALLED after another one counts twice.
         heard: (n, 2) running means of reported times believed force, and of believed force squared, any unit.
         share: (n,) share of the believed force that the speeds report, 0 to 1: a thruster whose ESC reports it as weak is not a liar.
     """
@@ -281,15 +282,15 @@ def judge(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, ne
             believed = believed_rpm(force_n[i], full_n[i], rpm_at_full[i])
             count, margin = counts[i], FAST_MARGIN * rpm_at_full[i]
             asked, given = believed * abs(believed), rpm * abs(rpm)
-            heard[i, 0] += TELLS * (given * asked - heard[i, 0])
-            heard[i, 1] += TELLS * (asked * asked - heard[i, 1])
+            heard[i, 0] += FEEDBACK_WEIGHT * (given * asked - heard[i, 0])
+            heard[i, 1] += FEEDBACK_WEIGHT * (asked * asked - heard[i, 1])
             share[i] = min(1.0, max(0.0, heard[i, 0] / heard[i, 1])) if heard[i, 1] > 0.0 else 1.0
             stands = abs(rpm) < dead_share * abs(believed)
             wrong_way = rpm * believed < 0.0 and not stands and abs(rpm - believed) > margin
-            count[DOWN] = count[DOWN] + 1 if status in ESC_DOWN else 0
+            count[ESC_FAILED] = count[ESC_FAILED] + 1 if status in ESC_DOWN else 0
             if abs(force_n[i]) >= least_n:
-                count[STANDS] = count[STANDS] + (2 if count[STANDS] > 0 and abs(force_n[i]) >= CLEAR * least_n else 1) if stands else 0
-            count[DISOBEYS] = count[DISOBEYS] + 1 if wrong_way or abs(rpm) > FAST_SHARE * abs(believed) + margin else 0
+                count[STALLED] = count[STALLED] + (2 if count[STALLED] > 0 and abs(force_n[i]) >= CLEAR * least_n else 1) if stands else 0
+            count[WRONG_SPEED] = count[WRONG_SPEED] + 1 if wrong_way or abs(rpm) > FAST_SHARE * abs(believed) + margin else 0
             for kind in range(len(WHY)):
                 found = found or count[kind] >= needed[kind]
     return found

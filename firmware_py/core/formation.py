@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 class Formation:
     """The bodies of a fleet as they are docked now, each with its stages."""
 
-    def __init__(self, chains: list[BodyPipeline], docking: DockingStage, parameters: Parameters) -> None:
-        self.chains, self.docking = chains, docking
+    def __init__(self, pipelines: list[BodyPipeline], docking: DockingStage, parameters: Parameters) -> None:
+        self.pipelines, self.docking = pipelines, docking
         self.parameters = parameters
         """The present parameters; bodies still in preparation get them when they begin."""
         self._watch_joints()
@@ -30,13 +30,13 @@ class Formation:
     @property
     def bodies(self) -> list[Body]:
         """The bodies, ordered by number."""
-        return [chain.body for chain in self.chains]
+        return [pipeline.body for pipeline in self.pipelines]
 
     def retune(self, parameters: Parameters) -> None:
         """Changes the parameters from this tick on."""
         self.parameters = parameters
-        for chain in self.chains:
-            chain.retune(parameters)
+        for pipeline in self.pipelines:
+            pipeline.retune(parameters)
         self.docking.retune(parameters.docking)
 
     def step(self, inputs: Inputs, estimates: dict[int, Estimate], outputs: Outputs) -> None:
@@ -44,9 +44,9 @@ class Formation:
         if not (inputs.prepared or self.docking.has_work):
             outputs.joints = self.docking.joints
             return
-        bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self.chains}
+        bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self.pipelines}
         waiting, holding = (self._armed_in(mode) if inputs.prepared else [] for mode in (Mode.DOCK, Mode.POSHOLD))
-        coming = [c.body.index for c in self.chains if c.guidance.comes] if self.docking.under_way else []
+        coming = [c.body.index for c in self.pipelines if c.guidance.is_coming] if self.docking.under_way else []
         decisions = self.docking.step(inputs, bodies, waiting, holding, coming, self._resting())
         self._miss_partners(outputs, [parted.whole for parted in decisions.parts])
         outputs.docks += self.docking.records
@@ -58,26 +58,26 @@ class Formation:
             self._part(parted, inputs.time_ns, estimates)
         outputs.events += self.docking.events
 
-    def asked(self, chain: BodyPipeline, granted: Sequence[DockRequest]) -> list[DockRequest | PartRequest]:
+    def asked(self, pipeline: BodyPipeline, granted: Sequence[DockRequest]) -> list[DockRequest | PartRequest]:
         """Preparations needed for the docks and undocks of a body that were granted in this tick."""
-        if not chain.supervisor.armed:
-            return [self._parting(chain, request) for request in granted]
-        self.docking.expect(chain.body.index, granted)
+        if not pipeline.supervisor.armed:
+            return [self._parting(pipeline, request) for request in granted]
+        self.docking.expect(pipeline.body.index, granted)
         return [*granted]
 
-    def _parting(self, chain: BodyPipeline, request: DockRequest) -> DockRequest | PartRequest:
+    def _parting(self, pipeline: BodyPipeline, request: DockRequest) -> DockRequest | PartRequest:
         """The undock of a disarmed body, which no magnet pushes open: it parts where it has come apart, whichever side was named."""
-        apart = [joint for joint in self.docking.open_joints(APART) if joint.module in chain.body.modules]
+        apart = [joint for joint in self.docking.open_joints(APART) if joint.module in pipeline.body.modules]
         named = [joint for joint in apart if modules_of(joint) == modules_of(request)]
         return PartRequest((*named, *(joint for joint in apart if joint not in named))) if named else request
 
-    def leave(self, chain: BodyPipeline, outputs: Outputs) -> None:
+    def leave(self, pipeline: BodyPipeline, outputs: Outputs) -> None:
         """Ends docks and undocks of a body at once when its mode is not DOCK."""
-        supervisor = chain.supervisor
+        supervisor = pipeline.supervisor
         if supervisor.mode != Mode.DOCK:
             surfaces = supervisor.armed and supervisor.mode == Mode.SURFACE
-            self._steer(self.docking.leave(chain.body, surfaces))
-            outputs.events += [event._replace(body=chain.body.index) for event in self.docking.events]
+            self._steer(self.docking.leave(pipeline.body, surfaces))
+            outputs.events += [event._replace(body=pipeline.body.index) for event in self.docking.events]
 
     def _miss_partners(self, outputs: Outputs, parted: Sequence[int]) -> None:
         """Reports joints that are open without a request to their bodies, and asks for the parting of bodies that have come apart once
@@ -85,116 +85,116 @@ class Formation:
         """
         loose = self.docking.open_joints(LOOSE)
         apart = self.docking.open_joints(APART) if loose else []
-        for chain in self.chains:
-            if not chain.joints or chain.body.index in parted:
+        for pipeline in self.pipelines:
+            if not pipeline.joints or pipeline.body.index in parted:
                 continue
-            mine = [joint for joint in loose if joint.module in chain.body.modules]
-            chain.health.topology, chain.health.open_joints = _words_of(mine), tuple(map(modules_of, mine))
-            gone = [joint for joint in apart if joint.module in chain.body.modules]
-            chain.parting = chain.parting if gone else []  # a joint that closes briefly may drop its plan: ask again when it opens
-            if gone and gone != chain.parting and chain.supervisor.armed and chain.supervisor.is_on("partner_lost"):
-                chain.parting = gone
+            mine = [joint for joint in loose if joint.module in pipeline.body.modules]
+            pipeline.health.topology, pipeline.health.open_joints = _words_of(mine), tuple(map(modules_of, mine))
+            gone = [joint for joint in apart if joint.module in pipeline.body.modules]
+            pipeline.parting = pipeline.parting if gone else []  # a joint that closes briefly may drop its plan: ask again when it opens
+            if gone and gone != pipeline.parting and pipeline.supervisor.armed and pipeline.supervisor.is_on("partner_lost"):
+                pipeline.parting = gone
                 outputs.preparations.append(PartRequest(tuple(gone)))
 
     def _armed_in(self, mode: Mode) -> list[int]:
         """Numbers of the bodies that are armed and in `mode`."""
-        return [chain.body.index for chain in self.chains if chain.supervisor.armed and chain.supervisor.mode == mode]
+        return [pipeline.body.index for pipeline in self.pipelines if pipeline.supervisor.armed and pipeline.supervisor.mode == mode]
 
     def _resting(self) -> list[tuple[int, int]]:
         """Modules and faces whose magnets have used up their on-time."""
         return [
             (module, face)
-            for chain in self.chains
-            if chain.joints
-            for module, magnets in zip(chain.body.modules, chain.limiter.magnets, strict=True)
+            for pipeline in self.pipelines
+            if pipeline.joints
+            for module, magnets in zip(pipeline.body.modules, pipeline.limiter.magnets, strict=True)
             for face in magnets.resting
         ]
 
     def _steer(self, decisions: Decisions) -> None:
-        for chain in self.chains:
-            number = chain.body.index
+        for pipeline in self.pipelines:
+            number = pipeline.body.index
             if number in decisions.returning:
-                chain.guidance.go_back()
+                pipeline.guidance.go_back()
             if number in decisions.meets:
-                chain.guidance.meet(decisions.meets[number])
+                pipeline.guidance.meet(decisions.meets[number])
             if number in decisions.setpoints:
-                chain.guidance.dock(decisions.setpoints[number])
+                pipeline.guidance.dock(decisions.setpoints[number])
             elif number in decisions.ended:
-                chain.dock_over = True
+                pipeline.dock_over = True
 
     def _join(self, joined: Join, time_ns: int, estimates: dict[int, Estimate]) -> None:
         before = self._chains_of(joined.target, joined.active)
-        estimate = self._begin(joined.chain, before, time_ns)
-        if any(chain.supervisor.armed for chain in before) and not joined.chain.supervisor.armed:
+        estimate = self._begin(joined.pipeline, before, time_ns)
+        if any(pipeline.supervisor.armed for pipeline in before) and not joined.pipeline.supervisor.armed:
             self.docking.events.append(Event(WARNING, "docked to a body that is not armed: all of it is disarmed"))
-        self._swap(before, [joined.chain], estimates, [estimate])
+        self._swap(before, [joined.pipeline], estimates, [estimate])
 
     def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:
         after = [parted.stays, parted.leaves]
         before = self._chains_of(parted.whole)
-        found = [self._begin(chain, before, time_ns) for chain in after]
+        found = [self._begin(pipeline, before, time_ns) for pipeline in after]
         parted.leaves.guidance.move_by(parted.away_w)
         self._swap(before, after, estimates, found)
 
-    def _begin(self, chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
+    def _begin(self, pipeline: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
         """Lets a prepared body take over, with the present parameters. Returns its estimate."""
-        if chain.parameters is not self.parameters:
-            chain.retune(self.parameters)
-        return take_over(chain, before, time_ns)
+        if pipeline.parameters is not self.parameters:
+            pipeline.retune(self.parameters)
+        return take_over(pipeline, before, time_ns)
 
     def _chains_of(self, *bodies: int) -> list[BodyPipeline]:
         """Pipelines of the bodies with these numbers, in this order. No body joins or parts twice in a tick."""
-        return [chain for number in bodies for chain in self.chains if chain.body.index == number]
+        return [pipeline for number in bodies for pipeline in self.pipelines if pipeline.body.index == number]
 
     def _swap(
         self, before: Sequence[BodyPipeline], after: Sequence[BodyPipeline], estimates: dict[int, Estimate], found: Sequence[Estimate]
     ) -> None:
-        for chain in before:
-            del estimates[chain.body.index]
-        for chain, estimate in zip(after, found, strict=True):
-            estimates[chain.body.index] = estimate
-        kept = [chain for chain in self.chains if chain not in before]
-        self.chains = sorted([*kept, *after], key=lambda chain: chain.body.index)
-        self._steer(self.docking.forget([chain.body.index for chain in before]))
+        for pipeline in before:
+            del estimates[pipeline.body.index]
+        for pipeline, estimate in zip(after, found, strict=True):
+            estimates[pipeline.body.index] = estimate
+        kept = [pipeline for pipeline in self.pipelines if pipeline not in before]
+        self.pipelines = sorted([*kept, *after], key=lambda pipeline: pipeline.body.index)
+        self._steer(self.docking.forget([pipeline.body.index for pipeline in before]))
         self._watch_joints()
 
     def _watch_joints(self) -> None:
-        self.docking.watch_joints([joint for chain in self.chains for joint in chain.joints])
+        self.docking.watch_joints([joint for pipeline in self.pipelines for joint in pipeline.joints])
 
 
-def take_over(chain: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
-    """Hands motion, forces, health and arm state of the previous bodies (its parts, or the whole) to `chain`. Returns its estimate."""
+def take_over(pipeline: BodyPipeline, before: Sequence[BodyPipeline], time_ns: int) -> Estimate:
+    """Hands motion, forces, health and arm state of the previous bodies (its parts, or the whole) to `pipeline`. Returns its estimate."""
     if len(before) == 1:
-        motion = part_of(before[0].body, before[0].estimator.motion, chain.body)
+        motion = part_of(before[0].body, before[0].estimator.motion, pipeline.body)
     else:
-        motion = join([(other.body, other.estimator.motion) for other in before], chain.body)
+        motion = join([(other.body, other.estimator.motion) for other in before], pipeline.body)
     for other in before:
-        _take_forces(chain, other)
-    chain.sensors.take_over([other.sensors for other in before])
-    chain.faults.take_over([other.faults for other in before])
-    chain.allocator.set_alive(chain.faults.now.alive)
-    chain.health.take_over([other.health for other in before])
-    chain.supervisor.take_over([other.supervisor for other in before])
-    estimate = chain.estimator.restart(time_ns, motion)
-    namesake = next((other.guidance for other in before if other.body.index == chain.body.index), None)
-    chain.guidance.take_over(chain.supervisor.mode, estimate, chain.body.thrusters.matrix @ chain.limiter.force_n, namesake)
+        _take_forces(pipeline, other)
+    pipeline.sensors.take_over([other.sensors for other in before])
+    pipeline.faults.take_over([other.faults for other in before])
+    pipeline.allocator.set_alive(pipeline.faults.now.alive)
+    pipeline.health.take_over([other.health for other in before])
+    pipeline.supervisor.take_over([other.supervisor for other in before])
+    estimate = pipeline.estimator.restart(time_ns, motion)
+    namesake = next((other.guidance for other in before if other.body.index == pipeline.body.index), None)
+    pipeline.guidance.take_over(pipeline.supervisor.mode, estimate, pipeline.body.thrusters.matrix @ pipeline.limiter.force_n, namesake)
     return estimate
 
 
-def _take_forces(chain: BodyPipeline, other: BodyPipeline) -> None:
+def _take_forces(pipeline: BodyPipeline, other: BodyPipeline) -> None:
     """Hands over thruster forces, so that no command jumps, the remaining on-time of magnets, and supply voltages."""
-    mine, theirs = chain.body, other.body
-    forces = [array.copy() for array in chain.lag.forces]
-    limited = chain.limiter.force_n.copy()
+    mine, theirs = pipeline.body, other.body
+    forces = [array.copy() for array in pipeline.lag.forces]
+    limited = pipeline.limiter.force_n.copy()
     for i, j in in_both(mine.modules, theirs.modules):
         here, there = mine.thrusters.module == i, theirs.thrusters.module == j
         for array, source in zip(forces, other.lag.forces, strict=True):
             array[here] = source[there]
         limited[here] = other.limiter.force_n[there]
-        chain.limiter.magnets[i] = other.limiter.magnets[j]
-        chain.supply.voltage_v[i] = other.supply.voltage_v[j]
-    chain.lag.restart(*forces)
-    chain.limiter.ease(limited)
+        pipeline.limiter.magnets[i] = other.limiter.magnets[j]
+        pipeline.supply.voltage_v[i] = other.supply.voltage_v[j]
+    pipeline.lag.restart(*forces)
+    pipeline.limiter.continue_from(limited)
 
 
 def _words_of(open_joints: Sequence[DockRequest]) -> str:

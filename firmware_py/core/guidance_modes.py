@@ -73,7 +73,7 @@ class Guidance:
         self._goal: Wish | None = None
         self._met: tuple[Wish, Wish | None] | None = None
         """Position held before the body moved to meet another, and the one that it was sent to."""
-        self._upright = self._lost = self._led = False
+        self._upright = self._was_unplaced = self._was_rate_commanded = False
         self._point: tuple[int, Setpoint] | None = None
         self._docking: Setpoint | Wish | None = None
         self._sticks, self._sticks_ns = Sticks(), 0
@@ -93,7 +93,7 @@ class Guidance:
         self._lift_n = p.surface_force_n * len(self._body.modules)
         self._glider.retune(p.bandwidth, p.speed_m_s, p.rate_rad_s)
 
-    def look(self, estimate: Estimate, health: Health) -> None:
+    def drop_stale_goals(self, estimate: Estimate, health: Health) -> None:
         """Drops goals when position and heading change their meaning; to be called before the decisions of a tick.
 
         That is when the estimate starts from gravity alone, and when tags then give position and heading.
@@ -160,7 +160,7 @@ class Guidance:
         self._met = before, self._goal
 
     @property
-    def comes(self) -> bool:
+    def is_coming(self) -> bool:
         """Whether the body is on its way to meet another: not yet at the meeting point, and not sent or steered elsewhere since."""
         if self._met is None or self._goal is not self._met[1]:
             return False
@@ -211,15 +211,17 @@ class Guidance:
             self._glider.put(self._docking)
             return self._docking, ahead_of(self._docking, self._lead_s)
         wish = self._wish(time_ns)
-        led, self._led = self._led, self.mode == Mode.GUIDED or bool(wish.v_w.any() or wish.w_b.any())
-        if self._led:  # by requested speeds, while something may hold the body back
+        was_rate_commanded = self._was_rate_commanded
+        self._was_rate_commanded = self.mode == Mode.GUIDED or bool(wish.v_w.any() or wish.w_b.any())
+        if self._was_rate_commanded:  # by requested speeds, while something may hold the body back
             self._glider.put(on_leash(self._glider.at, estimate))
-        elif led:
+        elif was_rate_commanded:
             self._go_on(estimate)
         now = self._glider.step(wish, dt_s)
-        lost, self._lost = self._lost, not self._placed(health)  # when tags return, the set-point follows the body for one more tick
-        if STEERING[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and (lost or self._lost)):
-            now = self._let_go(now, estimate)
+        was_unplaced, self._was_unplaced = self._was_unplaced, not self._placed(health)
+        # when tags return, the set-point follows the body for one more tick
+        if STEERING[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and (was_unplaced or self._was_unplaced)):
+            now = self._follow_body(now, estimate)
         return now, ahead_of(now, self._lead_s)
 
     def _sample(self, trajectory: Trajectory, time_ns: int) -> tuple[Setpoint, Setpoint] | None:
@@ -265,7 +267,7 @@ class Guidance:
         if self._goal is not None:
             return self._goal
         v_w = np.asarray(rotate(at.q_wb, p.speed_m_s * np.array(sticks.force)))
-        return Wish(self._held_in(at.p_wb, v_w), rate)
+        return Wish(self._velocity_in_fence(at.p_wb, v_w), rate)
 
     def _guided(self, time_ns: int) -> Wish:
         """Returns the newest streamed set-point, extrapolated by its own speed; it stops after `guided_timeout_s` without a newer one."""
@@ -278,9 +280,9 @@ class Guidance:
         if age_s > self._p.guided_timeout_s:
             v_w, w_b = ZERO, ZERO
         moved = np.where(np.isnan(point.v_w), 0.0, point.v_w) * min(age_s, self._p.guided_timeout_s)
-        return Wish(self._held_in(self._glider.at.p_wb, v_w), w_b, self._inside(point.p_wb + moved), q_wb)
+        return Wish(self._velocity_in_fence(self._glider.at.p_wb, v_w), w_b, self._inside(point.p_wb + moved), q_wb)
 
-    def _let_go(self, setpoint: Setpoint, estimate: Estimate) -> Setpoint:
+    def _follow_body(self, setpoint: Setpoint, estimate: Estimate) -> Setpoint:
         """Moves the set-point along with the body where position is not held: horizontally, or in all axes."""
         p_wb = estimate.p_wb.copy()
         if STEERING[self.mode].force != Keep.NOTHING:
@@ -303,7 +305,7 @@ class Guidance:
         low = np.array([-f.north_m, -f.east_m, f.top_m])
         return np.asarray(np.clip(p_wb, low, np.array([f.north_m, f.east_m, f.bottom_m])))
 
-    def _held_in(self, p_wb: np.ndarray, v_w: np.ndarray) -> np.ndarray:
+    def _velocity_in_fence(self, p_wb: np.ndarray, v_w: np.ndarray) -> np.ndarray:
         """Returns the velocity without the components that would lead out of the fence, or farther out, within a second."""
         soon = p_wb + v_w
         return np.where(np.abs(self._inside(soon) - soon) > np.abs(self._inside(p_wb) - p_wb), 0.0, v_w)

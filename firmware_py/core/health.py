@@ -168,7 +168,7 @@ class HealthMonitor:
         self._heard_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns = (never.copy() for _ in range(5))
         self._unfit, self._leak, self._wet = (dict.fromkeys(body.modules, False) for _ in range(3))
         self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa = (dict[int, float]() for _ in range(4))
-        self._told: tuple[dict[int, Any], ...] = (
+        self._per_module: tuple[dict[int, Any], ...] = (
             self._heard_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns, self._unfit, self._leak, self._wet,
             self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa,
         )  # fmt: skip
@@ -200,7 +200,7 @@ class HealthMonitor:
         """Inherits from the bodies that this one is made of, or was part of: the last reports of each module, and `_Latest`."""
         for other in before:
             self._stopped_ns |= other._stopped_ns
-            for mine, theirs in zip(self._told, other._told, strict=True):
+            for mine, theirs in zip(self._per_module, other._per_module, strict=True):
                 mine |= {module: told for module, told in theirs.items() if module in self._thruster_at}
             for module, thrusters in self._thruster_at.items():
                 for channel, thruster in other._thruster_at.get(module, {}).items():
@@ -223,7 +223,7 @@ class HealthMonitor:
             latest.foreign_sync_ns = now
         if inputs.foreign_command:
             latest.foreign_command_ns = now
-        self._people(requests, now)
+        self._hear_operators(requests, now)
         self._rates(inputs, estimate, (now - latest.time_ns) * 1e-9)
         self._judge_tags(estimate, now)
         latest.time_ns = now
@@ -322,7 +322,7 @@ class HealthMonitor:
                 if status not in ESC_DOWN and channel in thruster_at:
                     self._esc_ns[thruster_at[channel]] = now
 
-    def _people(self, requests: list[Request], now: int) -> None:
+    def _hear_operators(self, requests: list[Request], now: int) -> None:
         for request in requests:
             if request.action == Action.GROUND_ALIVE:
                 self._latest.ground_ns = now

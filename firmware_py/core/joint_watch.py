@@ -44,11 +44,11 @@ class JointWatch:
         """(k,) of docking_pairs.PAIR: state of every joint in this tick; a copy."""
         return self._bank.rows.copy()
 
-    def that_are_open(self, least: int) -> list[DockRequest]:
+    def open_joints(self, least: int) -> list[DockRequest]:
         """Joints that should hold but are at least `least` (LOOSE or APART), as requests that name their faces."""
         return [self._joints[k].request for k in np.flatnonzero(self._bank.rows["open"] >= least).tolist()] if self._joints else []
 
-    def left(self, requests: Sequence[DockRequest]) -> list[DockRequest]:
+    def existing(self, requests: Sequence[DockRequest]) -> list[DockRequest]:
         """The requests whose joints still exist."""
         there = [modules_of(joint.request) for joint in self._joints]
         return [request for request in requests if modules_of(request) in there]

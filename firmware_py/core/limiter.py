@@ -14,7 +14,7 @@ from numba import njit
 from firmware_py.core.body import Body
 from firmware_py.core.rotations import V
 from firmware_py.core.thruster import commands, module_power, polynomial, total_power
-from firmware_py.core.types import FACES, RELAY_OFF, RELAY_PULL, RELAY_PUSH, Room
+from firmware_py.core.types import FACES, RELAY_OFF, RELAY_PULL, RELAY_PUSH, ThrustLimits
 from firmware_py.description.parameters import Limiter as LimiterParameters
 
 VOLTAGE_EXPONENT = 1.2
@@ -41,8 +41,8 @@ class Limiter:
         self._all = np.ones(t.f_max.size, dtype=bool)
         self._nominal_v = body.nominal_v
         self._scale, self._scaled_for = np.ones(t.f_max.size), b""
-        self._room: Room | None = None
-        self._room_for: tuple[object, ...] = ()
+        self._thrust_limits: ThrustLimits | None = None
+        self._thrust_limits_for: tuple[object, ...] = ()
         self.magnets = [MagnetLimiter(parameters, dt_s) for _ in body.modules]
         """One per module."""
         self.force_n = np.zeros(t.f_max.size)
@@ -56,21 +56,21 @@ class Limiter:
             -np.array([polynomial(curve, 1.0) for curve in t.reverse]), np.array([polynomial(curve, 1.0) for curve in t.forward]),
         )  # fmt: skip
         self._step_n = parameters.slew_n_per_s * self._dt_s
-        self._room = None
+        self._thrust_limits = None
         for magnets in self.magnets:
             magnets.retune(parameters)
 
-    def room(self, voltage_v: np.ndarray) -> Room:
+    def limits(self, voltage_v: np.ndarray) -> ThrustLimits:
         """Returns the limits at this supply voltage (m,), less the power of the active magnets; the same object until they change."""
         scale, magnets_w = self._voltage_scale(voltage_v), [magnets.power_w for magnets in self.magnets]
-        if self._room is None or self._room_for != (self._scaled_for, magnets_w):
+        if self._thrust_limits is None or self._thrust_limits_for != (self._scaled_for, magnets_w):
             low, high, full_low, full_high = self._limits
             supply_w = np.array(self._supply) - magnets_w
-            self._room = Room(np.maximum(low, full_low * scale), np.minimum(high, full_high * scale), supply_w)
-            self._room_for = (self._scaled_for, magnets_w)
-        return self._room
+            self._thrust_limits = ThrustLimits(np.maximum(low, full_low * scale), np.minimum(high, full_high * scale), supply_w)
+            self._thrust_limits_for = (self._scaled_for, magnets_w)
+        return self._thrust_limits
 
-    def ease(self, force_n: np.ndarray) -> None:
+    def continue_from(self, force_n: np.ndarray) -> None:
         """Continues from the forces (n,) that these thrusters had in the bodies before, with the lower slew limit at first."""
         self.force_n, self._eased = force_n, self._eased_ticks
 

@@ -32,7 +32,7 @@ ALPHA_S = 0.03
 GYRO_BIASES, ACCEL_BIASES, DEPTH_BIASES = 0.1, 1.0, 0.5
 """Largest plausible deviation of a sensor from the mean of all, rad/s, m/s^2, m: twenty sigmas and more of the bench's draw of biases. A
 failed sensor reads zeros or its limit, off by gravity, until it is found."""
-TURN_NS = 100_000_000
+PRESSURE_SILENT_NS = 100_000_000
 """Time without a reading, while others are heard, after which a pressure sensor counts as silent: five times its period (DEPTH comes at
 50 Hz, DESIGN's bus)."""
 STILL_RAD_S = 0.05
@@ -56,18 +56,18 @@ class Measurements:
         per_s = 1e9 / period_ns
         self._gain = self._share * per_s
         count = len(body.modules)
-        self._apart = np.kron(np.ones((count, 1)), -self._mean_of_all)
+        self._deviation_matrix = np.kron(np.ones((count, 1)), -self._mean_of_all)
         """(3 count, 3 count) matrix from the readings of all modules to the difference of each from their mean, body frame."""
         for i in range(count):
-            self._apart[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += self._rotations[:, i]
+            self._deviation_matrix[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] += self._rotations[:, i]
         self._gyro_offsets = SensorOffsets(count, 3, GYRO_BIASES, period_ns)
         self._accel_offsets = SensorOffsets(count, 3, ACCEL_BIASES, period_ns)
         self._depth_offsets = SensorOffsets(count, 1, DEPTH_BIASES, period_ns)
-        self._turn = max(1, TURN_NS // period_ns)
-        self._depths_m, self._depth_age = np.zeros(count), np.full(count, self._turn)
+        self._pressure_silent_ticks = max(1, PRESSURE_SILENT_NS // period_ns)
+        self._depths_m, self._depth_age = np.zeros(count), np.full(count, self._pressure_silent_ticks)
         """Last depth of each sensor, and ticks with any depth reading since then."""
         self._no_swing = np.zeros(3 * count)
-        self._swing_of = per_s * -np.vstack([skew(r) for r in self._r_bi - self._mean_r_bi])
+        self._accel_from_rate_change = per_s * -np.vstack([skew(r) for r in self._r_bi - self._mean_r_bi])
         """(3 count, 3) matrix from the rate change within a tick to the resulting difference of each accelerometer from their mean."""
         self._is_still = False
         self._last_gyro: np.ndarray | None = None
@@ -102,9 +102,9 @@ class Measurements:
         stacked = heard[0] if len(heard) == 1 else np.concatenate(heard)
         if len(heard) < len(readings):
             which = [value is not None for value in readings]
-            return np.asarray(self._rotations[:, which].reshape(3, -1) @ stacked / len(heard) - offsets.of(which))
+            return np.asarray(self._rotations[:, which].reshape(3, -1) @ stacked / len(heard) - offsets.mean_offset(which))
         if swing is not None:
-            offsets.learn((self._apart @ stacked - swing).reshape(-1, 3))
+            offsets.learn((self._deviation_matrix @ stacked - swing).reshape(-1, 3))
         return np.asarray(self._mean_of_all.dot(stacked))
 
     def _accel(self, readings: list[np.ndarray | None], gyro: np.ndarray | None) -> np.ndarray | None:
@@ -127,7 +127,7 @@ class Measurements:
         """
         if not self._is_still or gyro is None or self._last_gyro is None:
             return None
-        return np.asarray(self._swing_of @ (gyro - self._last_gyro))
+        return np.asarray(self._accel_from_rate_change @ (gyro - self._last_gyro))
 
     def _follow(self, gyro: np.ndarray | None) -> None:
         """Updates the angular acceleration, rad/s^2: the smoothed change of the gyro from tick to tick; zero after a tick without gyro."""
@@ -164,8 +164,8 @@ class Measurements:
         """
         self._depth_age += 1
         self._depth_age[which], self._depths_m[which] = 0, each_m
-        if self._depth_age.max() > self._turn:
-            return float(self._depth_offsets.of(which)[0])
+        if self._depth_age.max() > self._pressure_silent_ticks:
+            return float(self._depth_offsets.mean_offset(which)[0])
         if self._is_still:
             self._depth_offsets.learn((self._depths_m - self._depths_m.mean()).reshape(-1, 1))
         return 0.0

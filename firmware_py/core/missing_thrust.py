@@ -41,7 +41,7 @@ MODEL_SHARE = 0.12
 share by which the water's drift changes the speed is added."""
 EXPLAINED = 0.8
 """Share of the change (squared, in sigmas) that one thruster must explain."""
-LEFT = 9.2
+MAX_UNEXPLAINED = 9.2
 """Squared sigmas that a thruster may leave unexplained: the 90 % quantile of chi-squared noise in the five axes that its loss does not
 determine. A wall, a hand or a rope pushes nearly as some thruster would, but seldom so exactly."""
 RUNNER_UP = 0.5
@@ -82,7 +82,7 @@ class MissingThrust:
             np.repeat([DRIFT_M_S * body.drag.cruise_slope / CRUISE_M_S, 0.0], 3),
             np.repeat([CROSS_SHARE * body.reach_m**2 * body.drag.cruise_slope / CRUISE_M_S, MODEL_SHARE * float(body.mass[0, 0])], 3),
         )  # fmt: skip
-        """Arguments sigma, tilt, doubt, drift and flow of `explain`."""
+        """Arguments noise_sigma, buoyancy_sigma, sigma_per_tilt, sigma_per_speed and flow_sigma of `explain`."""
         self._period_s = period_ns * 1e-9
         self.acquitted: int | None = None
         """Thruster that was left out because of its motion, and that this tick showed to be innocent."""
@@ -246,16 +246,19 @@ def _mean_of_whole(blocks):  # type: ignore[no-untyped-def]
 
 
 @njit(f"int64({M},{M},boolean[::1],{V},{V},{V},{V},{V},float64)", cache=True)
-def explain(blocks, columns, alive, sigma, tilt, doubt, drift, flow, lie_share):  # type: ignore[no-untyped-def]
+def explain(  # type: ignore[no-untyped-def]
+    blocks, columns, alive, noise_sigma, buoyancy_sigma, sigma_per_tilt, sigma_per_speed, flow_sigma, lie_share
+):
     """Returns the one thruster that explains the change of the latest blocks against the oldest, or -1.
 
     Args:
         blocks: (GAP + BASE, FORCES + n + 2) residual wrench 0:6, thruster wrench 6:12, down in the body 12:15, Coriolis wrench
             15:21, output of `add_flow` 21:27, forces, sigma of the tilt, speed.
         columns: (n, 6) wrench of unit force. alive: (n,) thrusters that may be suspected.
-        sigma, doubt, drift: (6,) sigma of a healthy body's change: of noise; per radian of sigma of the tilt; per m/s of speed.
-        flow: (6,) sigma of the moment per unit of change in the output of `add_flow`.
-        tilt: (4,) sigma of net buoyancy, N, and of weight times the lever of buoyancy along each axis, N m.
+        noise_sigma, sigma_per_tilt, sigma_per_speed: (6,) sigma of a healthy body's change: of noise; per radian of sigma of the tilt; per
+            m/s of speed.
+        flow_sigma: (6,) sigma of the moment per unit of change in the output of `add_flow`.
+        buoyancy_sigma: (4,) sigma of net buoyancy, N, and of weight times the lever of buoyancy along each axis, N m.
         lie_share: smallest share of its force that a liar has lost.
     """
     n = columns.shape[0]
@@ -265,7 +268,7 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, drift, flow, lie_share):
         return -1
     change = new - old
     tx, ty, tz = change[12:CORIOLIS] ** 2
-    lift, lx, ly, lz = tilt**2
+    lift, lx, ly, lz = buoyancy_sigma**2
     turned = (lift * tx, lift * ty, lift * tz, ly * tz + lz * ty, lz * tx + lx * tz, lx * ty + ly * tx)
     speed = max(old[FORCES + n + 1], new[FORCES + n + 1])
     coriolis_share = MODEL_SHARE + DRIFT_M_S / max(speed, DRIFT_M_S)
@@ -273,8 +276,9 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, drift, flow, lie_share):
     for i in range(6):
         model = (MODEL_SHARE * change[6 + i]) ** 2 + (coriolis_share * change[CORIOLIS + i]) ** 2
         if i >= 3:
-            model += (flow[i - 3] * change[CROSSED + i - 3]) ** 2 + (flow[i] * change[MUNK + i - 3]) ** 2
-        unsure[i] = math.sqrt(sigma[i] ** 2 + model + turned[i] + (doubt[i] * old[FORCES + n]) ** 2 + (drift[i] * speed) ** 2)
+            model += (flow_sigma[i - 3] * change[CROSSED + i - 3]) ** 2 + (flow_sigma[i] * change[MUNK + i - 3]) ** 2
+        of_tilt, of_speed = (sigma_per_tilt[i] * old[FORCES + n]) ** 2, (sigma_per_speed[i] * speed) ** 2
+        unsure[i] = math.sqrt(noise_sigma[i] ** 2 + model + turned[i] + of_tilt + of_speed)
         y[i] = change[i] / unsure[i]
         total += y[i] ** 2
     if total < SIGNIFICANT:
@@ -295,5 +299,5 @@ def explain(blocks, columns, alive, sigma, tilt, doubt, drift, flow, lie_share):
             best, least, second = t, left, least
         else:
             second = min(second, left)
-    sure = total - least >= SIGNIFICANT and least <= min(LEFT, (1.0 - EXPLAINED) * total)
+    sure = total - least >= SIGNIFICANT and least <= min(MAX_UNEXPLAINED, (1.0 - EXPLAINED) * total)
     return best if sure and least <= RUNNER_UP * second else -1

@@ -121,7 +121,7 @@ class BodyPipeline:
     def decide(self, inputs: Inputs, estimate: Estimate, requests: Sequence[Request]) -> list[DockRequest]:
         """Valid requests and fail-safes -> state and mode. Returns the docks and undocks that were granted."""
         mine = [r for r in requests if r.body == self.body.index or r.action in FOR_ALL]
-        self.guidance.look(estimate, self.health.step(inputs, estimate, mine, self.faults.now))
+        self.guidance.drop_stale_goals(estimate, self.health.step(inputs, estimate, mine, self.faults.now))
         was_armed = self.supervisor.armed
         decisions = self.supervisor.step(inputs.estop, self.health.now, mine, self._endings())
         for decision in decisions:
@@ -155,7 +155,7 @@ class BodyPipeline:
         setpoint, ahead = self.guidance.step(time_ns, estimate, health)
         wrench = self.controller.step(setpoint, ahead, estimate)
         wrench = self.guidance.mix(wrench, time_ns, estimate, health)
-        self.allocator.confine(self.limiter.room(self.supply.voltage_v))
+        self.allocator.confine(self.limiter.limits(self.supply.voltage_v))
         thrust = self._allocate(wrench, time_ns)
         armed, alive = self.supervisor.armed, self.faults.now.alive
         force, command = self.limiter.step(thrust.force_n, armed, self.supply.voltage_v, alive)
@@ -214,7 +214,7 @@ class Pipeline:
         """The present parameters."""
         return self.formation.parameters
 
-    def chain_of(self, body: Body) -> BodyPipeline:
+    def body_pipeline_of(self, body: Body) -> BodyPipeline:
         """Creates the stages of a future body: built outside the control loop, swapped in by a join or part."""
         return BodyPipeline(body, self.parameters, self._period_ns)
 
@@ -222,7 +222,7 @@ class Pipeline:
         """Runs one tick."""
         outputs = Outputs(inputs.tick, inputs.time_ns, [IDLE] * self._modules, False, [], [])
         formation, docking = self.formation, self.formation.docking
-        estimates = {chain.body.index: chain.measure(inputs) for chain in formation.chains}
+        estimates = {pipeline.body.index: pipeline.measure(inputs) for pipeline in formation.pipelines}
         before = formation.bodies
         formation.step(inputs, estimates, outputs)
         bodies = {body.index: body for body in formation.bodies}
@@ -230,19 +230,19 @@ class Pipeline:
         outputs.events += refusals
         if requests:
             self._retune(requests, outputs)
-        for chain in formation.chains:
-            granted = chain.decide(inputs, estimates[chain.body.index], requests)
-            outputs.preparations += formation.asked(chain, granted)
-            outputs.events += [event._replace(body=chain.body.index) for event in chain.supervisor.events]
-            outputs.estop = outputs.estop or chain.supervisor.raises_estop
+        for pipeline in formation.pipelines:
+            granted = pipeline.decide(inputs, estimates[pipeline.body.index], requests)
+            outputs.preparations += formation.asked(pipeline, granted)
+            outputs.events += [event._replace(body=pipeline.body.index) for event in pipeline.supervisor.events]
+            outputs.estop = outputs.estop or pipeline.supervisor.raises_estop
             if docking.under_way:
-                formation.leave(chain, outputs)
+                formation.leave(pipeline, outputs)
         wanted, due = docking.relays.states, docking.relays.due(inputs.time_ns)
-        for chain in formation.chains:
-            relays = chain.magnets(wanted, due)
-            record, command = chain.control(inputs.time_ns, estimates[chain.body.index])
+        for pipeline in formation.pipelines:
+            relays = pipeline.magnets(wanted, due)
+            record, command = pipeline.control(inputs.time_ns, estimates[pipeline.body.index])
             outputs.records.append(record)
-            _command(chain, command, relays, outputs)
+            _command(pipeline, command, relays, outputs)
         return outputs
 
     def _retune(self, requests: Sequence[Request], outputs: Outputs) -> None:
@@ -263,9 +263,9 @@ IDLE = ModuleCommand(False, np.zeros(CHANNELS), None)
 """Command of a module that belongs to no body."""
 
 
-def _command(chain: BodyPipeline, command: np.ndarray, relays: Mapping[int, tuple[int, ...]], outputs: Outputs) -> None:
+def _command(pipeline: BodyPipeline, command: np.ndarray, relays: Mapping[int, tuple[int, ...]], outputs: Outputs) -> None:
     """Writes each module's command: its own thrusters and, where due, its relays."""
-    armed, channels = chain.supervisor.armed, np.zeros((len(chain.body.modules), CHANNELS))
-    channels.put(chain.slots, command)
-    for module, thrusters in zip(chain.body.modules, channels, strict=True):
+    armed, channels = pipeline.supervisor.armed, np.zeros((len(pipeline.body.modules), CHANNELS))
+    channels.put(pipeline.slots, command)
+    for module, thrusters in zip(pipeline.body.modules, channels, strict=True):
         outputs.modules[module] = ModuleCommand(armed, thrusters, relays.get(module))

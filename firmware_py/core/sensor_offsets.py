@@ -32,6 +32,6 @@ class SensorOffsets:
         self._count = min(self._count + 1, self._longest)
         self._offsets += (differences - self._offsets) / self._count
 
-    def of(self, heard: list[bool]) -> np.ndarray:
+    def mean_offset(self, heard: list[bool]) -> np.ndarray:
         """(numbers,) offset of the mean of the sensors in `heard` from the mean of all."""
         return np.asarray(self._offsets[heard].mean(axis=0))

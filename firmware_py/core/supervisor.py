@@ -21,7 +21,7 @@ LADDER = {
     Level.DISARM: (Trigger.FAILSAFE_DISARM,),
 }
 """Triggers that a fail-safe tries in order until one is possible."""
-DESPITE: dict[Guard, tuple[str, ...]] = {Guard.MODE_PERMITTED: (), Guard.PARTING_PERMITTED: ("partner_lost",)}
+IGNORED_FAILSAFES: dict[Guard, tuple[str, ...]] = {Guard.MODE_PERMITTED: (), Guard.PARTING_PERMITTED: ("partner_lost",)}
 """Guards that consult the fail-safes, each with the fail-safes that it ignores."""
 MODE_LEVEL = {Mode.SURFACE: Level.SURFACE}
 """Level that a mode provides, whoever chose it: a milder fail-safe does not replace it."""
@@ -57,7 +57,7 @@ class Supervisor:
         self.raises_estop = False
         self.events: list[Event] = []
         self._estop_ns: int | None = None
-        self._let_go = True
+        self._was_idle = True
         """Whether the body was disarmed in the previous tick, with no module stopped and no recent e-stop that could still hold one."""
         self._testing = False
 
@@ -92,7 +92,7 @@ class Supervisor:
         """
         self.events = []
         decisions: list[Decision | None] = []
-        if estop or (health.stopped and (self.armed or self._let_go)):  # a module has heard an ESTOP that the firmware has not
+        if estop or (health.stopped and (self.armed or self._was_idle)):  # a module has heard an ESTOP that the firmware has not
             self._estop_ns = health.time_ns
             if not estop:
                 self._say(CRITICAL, f"e-stop: module {', '.join(map(str, health.stopped))} says that it heard one")
@@ -100,7 +100,7 @@ class Supervisor:
         decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger)]
         decisions += [self._request(request, health) for request in requests]
         decisions += self._run_failsafes(health)
-        self._let_go = self.state == State.DISARMED and not health.stopped and not self._estop_is_fresh(health)
+        self._was_idle = self.state == State.DISARMED and not health.stopped and not self._estop_is_fresh(health)
         return [decision for decision in decisions if decision is not None]
 
     def _request(self, request: Request, health: Health) -> Decision | None:
@@ -189,9 +189,9 @@ class Supervisor:
         holds = guard in (Guard.PARTING_PERMITTED, Guard.JOINT_OPEN) and modules_of(argument) not in health.open_joints
         if guard == Guard.JOINT_OPEN and holds:
             return ["the body is disarmed, and the joint is not open"]
-        if guard in DESPITE:
-            despite = DESPITE[Guard.MODE_PERMITTED if holds else guard]
-            reasons = missing(mode, health, self._p) or self._failsafes.against(mode, health, despite)
+        if guard in IGNORED_FAILSAFES:
+            ignored = IGNORED_FAILSAFES[Guard.MODE_PERMITTED if holds else guard]
+            reasons = missing(mode, health, self._p) or self._failsafes.reasons_against(mode, health, ignored)
             if self._testing:  # a test armed the body, so the arming checks for flight have not run yet
                 reasons = reasons or self._reasons(Guard.ARMING_CHECKS, mode, health)
             return reasons
@@ -226,7 +226,7 @@ class Supervisor:
         self.mode, self.level, self._chosen = next(iter(kept), Mode.POSHOLD), worst.level, worst._chosen
         self.raises_estop = any(other.raises_estop for other in before)
         self._estop_ns = max((other._estop_ns for other in before if other._estop_ns is not None), default=None)
-        self._let_go = all(other._let_go for other in before)
+        self._was_idle = all(other._was_idle for other in before)
         self._failsafes.take_over([other._failsafes for other in before])
 
     def _estop_age_ms(self, health: Health) -> float:

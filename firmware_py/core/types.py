@@ -278,7 +278,7 @@ class Setpoint(NamedTuple):
     """(3,) angular acceleration, wanted body frame."""
 
 
-class Room(NamedTuple):
+class ThrustLimits(NamedTuple):
     """What the limiter passes continuously: the limits of the allocation."""
 
     low_n: Array

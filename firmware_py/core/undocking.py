@@ -20,7 +20,7 @@ class Undock(NamedTuple):
     """State of an undock: magnets push until the body parts, which happens at once if every joint is open already."""
 
     plan: UndockPlan
-    chains: tuple[Any, ...]
+    pipelines: tuple[Any, ...]
     since_ns: int
     until_ns: int
     seen_ns: int
@@ -31,17 +31,17 @@ class Undock(NamedTuple):
     """Currents (2,) of the joints before the push, where both of their magnets were on."""
 
     @staticmethod
-    def begun(plan: UndockPlan, chains: tuple[Any, ...], time_ns: int, holds: bool, p: Docking, joints: JointWatch) -> Undock:
+    def begun(plan: UndockPlan, pipelines: tuple[Any, ...], time_ns: int, holds: bool, p: Docking, joints: JointWatch) -> Undock:
         """Creates an undock that begins now; `holds`: not every joint is open."""
         push_ns, seen_ns = (round(ns) if holds else 0 for ns in (p.release_s * 1e9, 2e6 * p.pose_fresh_ms))
         last_ns = time_ns + max(2 * push_ns, seen_ns)
         before_ma = {joint: joints.strong_ma(joint) for joint in plan.opens}
-        return Undock(plan, chains, time_ns, time_ns + push_ns, time_ns + seen_ns, last_ns, before_ma)
+        return Undock(plan, pipelines, time_ns, time_ns + push_ns, time_ns + seen_ns, last_ns, before_ma)
 
     def pushes(self, time_ns: int, joints: JointWatch) -> bool:
         """Whether it is too early to call `held_by`: a single joint waits for a picture, several joints for their currents."""
-        is_told = self._is_seen if len(self.plan.opens) == 1 else self._is_felt
-        return time_ns < self.until_ns or (time_ns < self.seen_ns and not is_told(time_ns, joints))
+        has_evidence = self._has_picture if len(self.plan.opens) == 1 else self._has_currents
+        return time_ns < self.until_ns or (time_ns < self.seen_ns and not has_evidence(time_ns, joints))
 
     def held_by(self, time_ns: int, joints: JointWatch) -> str:
         """Evidence, in words, that a joint still holds, as with a stuck relay: parted, the two bodies would fly against each other. Empty
@@ -51,16 +51,16 @@ class Undock(NamedTuple):
         prove nothing: only currents count.
         """
         half_ns, joint = self._half_ns(time_ns), self.plan.opens[0]
-        if len(self.plan.opens) == 1 and self._is_seen(time_ns, joints):
+        if len(self.plan.opens) == 1 and self._has_picture(time_ns, joints):
             return IN_PLACE if joints.newest_ns(joint, "near_ns") > half_ns else ""
         pulled = ((before, joints.strong_ma(joint, half_ns)) for joint, before in self.before_ma.items())
         return PULLED if any(a is not None and b is not None and np.all(a * b > 0.0) for a, b in pulled) else ""
 
-    def _is_seen(self, time_ns: int, joints: JointWatch) -> bool:
+    def _has_picture(self, time_ns: int, joints: JointWatch) -> bool:
         """Whether a picture shows the first joint in the latter half of the push."""
         return joints.newest_ns(self.plan.opens[0], "picture_ns") > self._half_ns(time_ns)
 
-    def _is_felt(self, time_ns: int, joints: JointWatch) -> bool:
+    def _has_currents(self, time_ns: int, joints: JointWatch) -> bool:
         """Whether every joint with currents before the push has newer ones from its latter half."""
         felt = [joint for joint, before in self.before_ma.items() if before is not None]
         return all(joints.newest_ns(joint, "current_ns") > self._half_ns(time_ns) for joint in felt)

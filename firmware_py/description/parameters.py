@@ -11,7 +11,7 @@ from pathlib import Path
 
 from firmware_py.description.failsafe_parameters import Failsafes, Faults, Fence
 from firmware_py.description.ground_parameters import Ground
-from firmware_py.description.schema import DescriptionError, Limits, build, describe, limits_of, meant, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, Limits, build, describe, did_you_mean, limits_of, quantity, read_toml
 from firmware_py.description.steering_parameters import Steering
 
 
@@ -327,7 +327,7 @@ class Parameters:
         """Returns a copy with `group.field` set. Raises DescriptionError if there is no such field or the value is out of range."""
         group_name, _, name = dotted.partition(".")
         if dotted not in (known := dict(registry())):
-            raise DescriptionError(f"parameter {dotted!r} is unknown; {meant(dotted, known)}`modcube parameters` prints them all")
+            raise DescriptionError(f"parameter {dotted!r} is unknown; {did_you_mean(dotted, known)}`modcube parameters` prints them all")
         group = getattr(self, group_name)
         limits = limits_of(type(group), name)
         if isinstance(getattr(group, name), int) and isinstance(value, float) and value.is_integer():

@@ -177,7 +177,7 @@ def parse_toml(text: str, path: str) -> dict[str, Any]:
         raise DescriptionError(f"{path}:{match.group(1) if match else last}: not valid TOML: {str(error).splitlines()[0]}") from None
 
 
-def meant(word: str, known: Iterable[str]) -> str:
+def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A "did you mean" question for the name in `known` that is closest to `word`; empty if none is close."""
     names, small = {name.lower(): name for name in known}, word.lower()
     near = [name for name in names if name.startswith(f"{small}_")] or difflib.get_close_matches(small, names, 1)  # the unit was left out
@@ -205,7 +205,8 @@ def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str |
     for key in table:
         if key not in fields:
             known = ", ".join(sorted(fields))
-            raise source.error((*keys, key), f"unknown key; {meant(key, fields) or _helped(key, cls)}permitted here: {known}")
+            question = did_you_mean(key, fields) or _did_you_mean_by_help(key, cls)
+            raise source.error((*keys, key), f"unknown key; {question}permitted here: {known}")
     values: dict[str, Any] = {}
     for name, field in fields.items():
         if name in table:
@@ -218,7 +219,7 @@ def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str |
         raise source.error(keys, str(error), error.keys) from None
 
 
-def _helped(word: str, cls: type) -> str:
+def _did_you_mean_by_help(word: str, cls: type) -> str:
     """A "did you mean" question for the only field whose help contains `word`; empty if none or several do."""
     told = [field.name for field in dataclasses.fields(cls) if word in re.findall(r"\w+", limits_of(cls, field.name).help)]
     return f"did you mean {told[0]}? " if len(told) == 1 else ""
@@ -335,7 +336,7 @@ def _scalar(hint: Any, limits: Limits, value: Any, source: Source, keys: tuple[s
         return value
     if hint is str:
         if limits.choices and value not in limits.choices:
-            raise source.error(keys, f"{_shown(value)} is unknown; {meant(value, limits.choices)}permitted: {describe(limits)}")
+            raise source.error(keys, f"{_shown(value)} is unknown; {did_you_mean(value, limits.choices)}permitted: {describe(limits)}")
         return value
     try:
         if limits.low <= value <= limits.high and math.isfinite(float(value)):

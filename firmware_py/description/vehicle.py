@@ -18,10 +18,10 @@ from firmware_py.description.schema import (
     DescriptionError,
     Source,
     build,
+    did_you_mean,
     frozen_array,
     is_file_name,
     limits_of,
-    meant,
     quantity,
     read_toml,
     repeated,
@@ -254,9 +254,8 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
     elif name in vehicle_names():
         path = Path(str(resources.files("firmware_py") / "vehicles" / f"{name}.toml"))
     else:
-        raise DescriptionError(
-            f"vehicle {name!r} is unknown; {meant(name, vehicle_names())}there are {', '.join(vehicle_names())}, or give a .toml file"
-        )
+        question, known = did_you_mean(name, vehicle_names()), ", ".join(vehicle_names())
+        raise DescriptionError(f"vehicle {name!r} is unknown; {question}there are {known}, or give a .toml file")
     table, source = read_toml(path)
     vehicle: Vehicle = build(Vehicle, table, source)
     _check_body(vehicle, source)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.description.schema import DescriptionError, Source, build, meant, parse_toml, quantity
+from firmware_py.description.schema import DescriptionError, Source, build, did_you_mean, parse_toml, quantity
 from firmware_py.prepare.minimum_snap import Limits, Waypoint, check_bounded, plan
 from firmware_py.prepare.piecewise import Piecewise
 
@@ -151,7 +151,7 @@ def _header(header: list[str], path: str) -> list[str]:
     unknown = [name for name in header if name not in _COLUMNS]
     missing = [name for name in _POSITION if name not in header]
     twice = [name for at, name in enumerate(header) if name in header[:at]]
-    what = f"column {unknown[0][:_SHOWN]!r} is unknown; {meant(unknown[0][:_SHOWN], _COLUMNS)}" if unknown else ""
+    what = f"column {unknown[0][:_SHOWN]!r} is unknown; {did_you_mean(unknown[0][:_SHOWN], _COLUMNS)}" if unknown else ""
     what = what or (f"column {missing[0]!r} is missing; " if missing else f"column {twice[0]!r} is there twice; " if twice else "")
     if what:
         raise DescriptionError(f"{path}:1: {what}columns are {', '.join(_COLUMNS)}, commas between them")

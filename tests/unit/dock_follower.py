@@ -41,12 +41,12 @@ def face_of(body: Body, module: int, face: int, at: Estimate) -> tuple[np.ndarra
 class Follower:
     """The second module of a pair docks to the second of another, both tilted; the active pair is exactly where it is wanted."""
 
-    def __init__(self, parameters: Docking = STAGED, nu: np.ndarray = STILL, comes: bool = False) -> None:
+    def __init__(self, parameters: Docking = STAGED, nu: np.ndarray = STILL, target_approaches: bool = False) -> None:
         vehicles = [load_vehicle("modcube")] * 4
         self.target = assemble([(0, 0, 0), (0, 1, 0)], [0, 12], vehicles[:2], [0, 1])
         self.active = assemble([(0, 0, 0), (0, 0, 1)], [0, 12], vehicles[2:], [2, 3])
         self.plan = plan_dock(DockRequest(3, 3, 1, 0, 1), self.active, self.target, vehicles)
-        self.sequence = DockingSequence(self.plan, self.active, self.target, parameters, 0, comes)
+        self.sequence = DockingSequence(self.plan, self.active, self.target, parameters, 0, target_approaches)
         self.there = estimate(np.array([1.0, 2.0, 3.0]))._replace(q_wb=TILTED, nu=nu)
         self.face, self.outward = face_of(self.target, 1, 0, self.there)
         self.at = estimate(self.face + 0.5 * self.outward)._replace(q_wb=TILTED)

@@ -44,7 +44,7 @@ class Flight:
             self.time_ns += TICK
             if sticks is not None:
                 self.do(Effect.TAKE_STICKS, self.guidance.mode, sticks)
-            self.guidance.look(self.estimate, health)
+            self.guidance.drop_stale_goals(self.estimate, health)
             now, _ = self.guidance.step(self.time_ns, self.estimate, health)
             self.setpoints.append(now)
             self.wrenches.append(self.guidance.mix(WRENCH, self.time_ns, self.estimate, health))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from firmware_py.core.alignment import FirstSight, upright
+from firmware_py.core.alignment import TagAgreement, upright
 from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.estimator import READY_AFTER, RESET_AFTER, Estimator
 from firmware_py.core.rotations import difference, exp, from_euler, heading, multiply
@@ -120,56 +120,56 @@ def test_attitude_is_not_guessed_from_what_is_not_gravity(gyros: np.ndarray, acc
 
 
 def test_tags_that_tell_the_same_are_counted() -> None:
-    sight = FirstSight()
+    agreement = TagAgreement()
     for n in range(3):
-        assert sight.agrees(tag(n, P_WB + 0.01 * n), np.zeros(3), Q_WB)
-    assert sight.count == 3
+        assert agreement.agrees(tag(n, P_WB + 0.01 * n), np.zeros(3), Q_WB)
+    assert agreement.count == 3
 
 
 @pytest.mark.parametrize(("p_wb", "q_wb"), [
     (P_WB + np.array([0.0, 0.11, 0.0]), Q_WB), (P_WB, multiply(from_euler(0.0, 0.0, 0.11), Q_WB)),
 ], ids=["elsewhere", "heading elsewhere"])  # fmt: skip
 def test_tag_that_tells_another_place_or_heading_begins_the_count_anew(p_wb: np.ndarray, q_wb: np.ndarray) -> None:
-    sight = FirstSight()
+    agreement = TagAgreement()
     for n in range(5):
-        sight.agrees(tag(n), np.zeros(3), Q_WB)
-    assert sight.agrees(tag(5, p_wb, q_wb), np.zeros(3), Q_WB) and sight.count == 1
-    assert sight.agrees(tag(6, p_wb, q_wb), np.zeros(3), Q_WB) and sight.count == 2
+        agreement.agrees(tag(n), np.zeros(3), Q_WB)
+    assert agreement.agrees(tag(5, p_wb, q_wb), np.zeros(3), Q_WB) and agreement.count == 1
+    assert agreement.agrees(tag(6, p_wb, q_wb), np.zeros(3), Q_WB) and agreement.count == 2
 
 
 @pytest.mark.parametrize(("gap_s", "moved_m", "count"), [(0.2, 0.25, 6), (0.2, 0.35, 1), (1.0, 1.0, 6), (1.01, 0.0, 1)])
 def test_tags_that_come_seldom_tell_the_same_of_a_robot_that_moves_and_nothing_after_a_second(
     gap_s: float, moved_m: float, count: int
 ) -> None:
-    sight = FirstSight()
+    agreement = TagAgreement()
     for n in range(5):
-        sight.agrees(tag(n), np.zeros(3), Q_WB)
-    sight.agrees(tag(4 + round(gap_s * 1e9), P_WB + np.array([moved_m, 0.0, 0.0])), np.zeros(3), Q_WB)
-    assert sight.count == count
+        agreement.agrees(tag(n), np.zeros(3), Q_WB)
+    agreement.agrees(tag(4 + round(gap_s * 1e9), P_WB + np.array([moved_m, 0.0, 0.0])), np.zeros(3), Q_WB)
+    assert agreement.count == count
 
 
 @pytest.mark.parametrize(("known_m", "count"), [(0.5, 2), (0.0, 1)])
 def test_tags_of_a_robot_that_moves_tell_the_same_where_its_way_is_known(known_m: float, count: int) -> None:
-    sight, way = FirstSight(), np.array([1.0, 0.0, 0.0])
-    sight.agrees(tag(0), np.zeros(3), Q_WB)
-    sight.agrees(tag(16_000_000, P_WB + 0.5 * way), known_m * way, Q_WB)
-    assert sight.count == count
+    agreement, way = TagAgreement(), np.array([1.0, 0.0, 0.0])
+    agreement.agrees(tag(0), np.zeros(3), Q_WB)
+    agreement.agrees(tag(16_000_000, P_WB + 0.5 * way), known_m * way, Q_WB)
+    assert agreement.count == count
 
 
 def test_headings_are_compared_around_the_circle() -> None:
-    sight = FirstSight()
+    agreement = TagAgreement()
     for n, north in enumerate((math.pi - 0.02, -math.pi + 0.02, math.pi - 0.02)):
-        assert sight.agrees(tag(n, q_wb=from_euler(0.0, 0.0, north)), np.zeros(3), from_euler(0.0, 0.0, 0.0))
-    assert sight.count == 3
+        assert agreement.agrees(tag(n, q_wb=from_euler(0.0, 0.0, north)), np.zeros(3), from_euler(0.0, 0.0, 0.0))
+    assert agreement.count == 3
 
 
 @pytest.mark.parametrize(("tilt_rad", "agrees"), [(0.34, True), (0.36, False), (0.7, False), (math.pi, False)])
 def test_tag_with_another_way_down_does_not_agree(tilt_rad: float, agrees: bool) -> None:
-    sight = FirstSight()
-    sight.agrees(tag(0), np.zeros(3), Q_WB)
+    agreement = TagAgreement()
+    agreement.agrees(tag(0), np.zeros(3), Q_WB)
     flipped = multiply(from_euler(0.0, 0.0, 1.0), multiply(exp(np.array([0.0, tilt_rad, 0.0])), Q_WB))
-    assert sight.agrees(tag(1, q_wb=flipped), np.zeros(3), Q_WB) is agrees
-    assert sight.count == 1, "gravity has left out what is flipped: the others count on"
+    assert agreement.agrees(tag(1, q_wb=flipped), np.zeros(3), Q_WB) is agrees
+    assert agreement.count == 1, "gravity has left out what is flipped: the others count on"
 
 
 # ---------------------------------------------------------------- the estimator

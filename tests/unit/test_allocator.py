@@ -12,12 +12,12 @@ from scipy.optimize import linprog, lsq_linear
 from firmware_py.core.allocator import Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.preload import preload
-from firmware_py.core.types import Room, Thrust
+from firmware_py.core.types import Thrust, ThrustLimits
 from firmware_py.description.parameters import Allocation
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
-HOLD, SHARE_WEIGHT, PRIORITIES = 0.05, 1e3, np.array([1e2, 1e2, 1.0])
+HOLDING_SHARE, SHARE_WEIGHT, PRIORITIES = 0.05, 1e3, np.array([1e2, 1e2, 1.0])
 """A twentieth of the largest push is the holding force. Losing it, or the moment, costs a hundred times as much as losing the rest of the
 force, and that costs SHARE_WEIGHT times as much as all thrusters at their limits."""
 PLAIN = replace(Allocation(), preload_n=0.0)
@@ -79,7 +79,7 @@ def test_no_wrench_is_no_force(body: Body) -> None:
 def held_n(body: Body) -> float:
     """Holding force, which has the same priority as the moment, N."""
     t = body.thrusters
-    return HOLD * float(np.linalg.norm(t.matrix[:3], axis=0) @ np.maximum(t.f_max, -t.f_min))
+    return HOLDING_SHARE * float(np.linalg.norm(t.matrix[:3], axis=0) @ np.maximum(t.f_max, -t.f_min))
 
 
 def in_parts(body: Body, wrench: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -375,12 +375,12 @@ def power_w(body: Body, thrust: Thrust) -> np.ndarray:
 
 def test_other_limits_count_at_once_and_are_kept_when_a_thruster_dies(single: Body) -> None:
     allocator = Allocator(single, PLAIN)
-    room = Room(0.4 * single.thrusters.f_min, 0.5 * single.thrusters.f_max, np.array([1e6]))
-    allocator.confine(room)
+    limits = ThrustLimits(0.4 * single.thrusters.f_min, 0.5 * single.thrusters.f_max, np.array([1e6]))
+    allocator.confine(limits)
     allocator.set_alive(np.arange(8) != 7)
     for wrench in wrenches(single, 20, 2.0):
         thrust = allocator.step(wrench)
-        assert np.all(thrust.force_n <= room.high_n) and np.all(thrust.force_n >= room.low_n) and thrust.force_n[7] == 0.0
+        assert np.all(thrust.force_n <= limits.high_n) and np.all(thrust.force_n >= limits.low_n) and thrust.force_n[7] == 0.0
         assert thrust.margin == pytest.approx(0.0, abs=1e-9)
 
 
@@ -391,7 +391,7 @@ def test_body_that_cannot_be_fed_gives_way_in_the_force_that_does_not_hold_first
     fed_less = 0
     for wrench in wrenches(body, 30, size) * np.repeat([1.0, 0.2], 3):
         supply_w = 0.5 * power_w(body, plenty.step(wrench))
-        allocator.confine(Room(body.thrusters.f_min, body.thrusters.f_max, supply_w))
+        allocator.confine(ThrustLimits(body.thrusters.f_min, body.thrusters.f_max, supply_w))
         thrust = allocator.step(wrench)
         assert np.all(power_w(body, thrust) <= supply_w)
         first = np.sum(in_parts(body, wrench)[:2], axis=0)
@@ -413,7 +413,7 @@ def test_paper_s_allocation_leaves_the_supply_to_the_limiter(single: Body) -> No
     allocator = Allocator(single, replace(PLAIN, mode="pseudo_inverse"))
     wrench = np.array([15.0, 0.0, 0.0, 0.0, 0.4, 0.0])
     before = allocator.step(wrench)
-    allocator.confine(Room(single.thrusters.f_min, single.thrusters.f_max, np.array([1.0])))
+    allocator.confine(ThrustLimits(single.thrusters.f_min, single.thrusters.f_max, np.array([1.0])))
     np.testing.assert_array_equal(allocator.step(wrench).force_n, before.force_n)
 
 
@@ -423,14 +423,14 @@ def test_body_whose_supply_cannot_feed_the_preload_leaves_it_to_the_limiter() ->
     allocator, wrench = Allocator(pair, Allocation()), np.array([3.0, 0.0, 0.0, 0.0, 0.1, 0.0])
     before = allocator.step(wrench)
     preload_w = power_w(pair, allocator.step(np.zeros(6)))
-    allocator.confine(Room(pair.thrusters.f_min, pair.thrusters.f_max, preload_w * [0.9, 100.0]))
+    allocator.confine(ThrustLimits(pair.thrusters.f_min, pair.thrusters.f_max, preload_w * [0.9, 100.0]))
     np.testing.assert_array_equal(allocator.step(wrench).force_n, before.force_n)
 
 
 def test_least_power_keeps_within_the_room(single: Body) -> None:
     allocator = Allocator(single, replace(Allocation(), mode="least_power"))
-    room = Room(0.3 * single.thrusters.f_min, 0.3 * single.thrusters.f_max, np.array([1e6]))
-    allocator.confine(room)
+    limits = ThrustLimits(0.3 * single.thrusters.f_min, 0.3 * single.thrusters.f_max, np.array([1e6]))
+    allocator.confine(limits)
     for wrench in wrenches(single, 60, 0.15):
         thrust = allocator.step(wrench)
-        assert np.all(thrust.force_n <= room.high_n + 1e-12) and np.all(thrust.force_n >= room.low_n - 1e-12)
+        assert np.all(thrust.force_n <= limits.high_n + 1e-12) and np.all(thrust.force_n >= limits.low_n - 1e-12)

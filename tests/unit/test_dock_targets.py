@@ -44,7 +44,7 @@ def test_target_that_is_disarmed_is_not_expected_to_come(approach: str) -> None:
     tank = before_each_other(2.0, parameters=Parameters().replace("docking.approach", approach), armed=(1,))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     (dock,) = tank.pipeline.formation.docking._docks
-    assert dock.sequence.meets_at_w is None and tank.pipeline.formation.chains[0].guidance._goal is None
+    assert dock.sequence.meets_at_w is None and tank.pipeline.formation.pipelines[0].guidance._goal is None
 
 
 @pytest.mark.slow
@@ -66,7 +66,7 @@ def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
     tank = before_each_other(2.0)
     for turns in (0, 1, 0, 1):
         tank.run(0.2, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, turns, True)))
-    goal = tank.pipeline.formation.chains[0].guidance._goal
+    goal = tank.pipeline.formation.pipelines[0].guidance._goal
     assert goal is not None and goal.p_wb is not None
     assert 0.6 < goal.p_wb[1] < 0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m) + 0.01
 
@@ -79,16 +79,16 @@ def test_target_does_not_come_to_meet_a_robot_that_has_left_the_dock_before_it_w
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     tank.run(1.0, stop)
     assert tank.when(f"dock refused: {NO_LONGER}")
-    assert tank.pipeline.formation.chains[0].guidance._goal is None
+    assert tank.pipeline.formation.pipelines[0].guidance._goal is None
 
 
 @pytest.mark.slow
 def test_target_that_comes_goes_back_when_the_dock_is_called_off() -> None:
     tank = before_each_other(2.0)
-    held = tank.pipeline.formation.chains[0].guidance._glider.at.p_wb.copy()
+    held = tank.pipeline.formation.pipelines[0].guidance._glider.at.p_wb.copy()
     tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     tank.run(0.1, Request(Action.SET_MODE, 1, Mode.POSHOLD))
-    goal = tank.pipeline.formation.chains[0].guidance._goal
+    goal = tank.pipeline.formation.pipelines[0].guidance._goal
     assert goal is not None and goal.p_wb is not None
     np.testing.assert_allclose(goal.p_wb, held, atol=0.02)
 
@@ -100,11 +100,11 @@ def test_target_that_comes_goes_back_when_the_body_that_it_comes_to_meet_is_take
         state[:7] = [1.0, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
     tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 2))
-    held = tank.pipeline.formation.chains[0].guidance._held().p_wb.copy()
+    held = tank.pipeline.formation.pipelines[0].guidance._held().p_wb.copy()
     tank.run(0.5, Request(Action.DOCK, 2, DockRequest(2, 3, 1, 2, 0, True)))
     tank.run(2.0, Request(Action.UNDOCK, 2, DockRequest(3, 3, 2, 2)))
     assert tank.shape == [(0, 1), (2,), (3,)] and tank.when(f"dock of module 2 ended: {CHANGED}")
-    np.testing.assert_allclose(tank.pipeline.formation.chains[0].guidance._held().p_wb, held, atol=0.02)
+    np.testing.assert_allclose(tank.pipeline.formation.pipelines[0].guidance._held().p_wb, held, atol=0.02)
 
 
 ELSEWHERE = Request(Action.HOLD, 0, rest_at(np.array([1.0, -0.5, 0.8]), np.array([1.0, 0.0, 0.0, 0.0])))
@@ -116,7 +116,7 @@ LEFTWARDS = Request(Action.STICKS, 0, Sticks((0.0, -1.0, 0.0)))
 def test_target_that_came_and_was_moved_by_a_person_since_stays_there_when_the_dock_is_called_off(move: Request) -> None:
     tank = before_each_other(3.0)
     tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
-    guidance = tank.pipeline.formation.chains[0].guidance
+    guidance = tank.pipeline.formation.pipelines[0].guidance
     assert guidance._goal is not None
     tank.run(1.0, move)
     goal = guidance._goal
@@ -146,7 +146,7 @@ def test_target_comes_to_meet_the_first_of_two_alone() -> None:
     wanted = DockRequest(1, 3, 0, 2, 0, True), DockRequest(2, 2, 0, 3, 0, True)
     tank.run(0.2, *(Request(Action.DOCK, request.module, request) for request in wanted))
     assert len(tank.outputs[-1].docks) == 2
-    goal = tank.pipeline.formation.chains[0].guidance._goal
+    goal = tank.pipeline.formation.pipelines[0].guidance._goal
     assert goal is not None and goal.p_wb is not None
     assert goal.p_wb[1] == pytest.approx(0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m), abs=0.01)
 
@@ -197,7 +197,7 @@ def test_dock_says_of_each_module_once_that_it_waits_though_two_are_as_near() ->
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     met = cycle([2, 3])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("firmware_py.core.docking_traffic.first_met", lambda *_: next(met))
+        patch.setattr("firmware_py.core.docking_traffic.first_blocking_module", lambda *_: next(met))
         tank.run(0.2)
     assert [said for _, said in tank.said if "waits" in said] == [f"dock of module 1 waits: module {m} is on its way" for m in (2, 3)]
 
@@ -305,7 +305,7 @@ def test_straight_line_to_a_target_that_comes_to_meet_another_is_drawn_once_it_i
     assert first.stage == Stage.APPROACH and second.stage == Stage.PRE_APPROACH
     while second.stage == Stage.PRE_APPROACH:
         tank.run(0.01)
-    there = second.met(tank.outputs[-1].records[0].estimate).p_wb
+    there = second.target_to_meet(tank.outputs[-1].records[0].estimate).p_wb
     np.testing.assert_allclose(there, first.meets_at_w, atol=0.01)
 
 

@@ -17,11 +17,11 @@ from firmware_py.prepare.docking import plan_dock
 from tests.unit.dock_follower import DRIFT, NEITHER, STAGED, TICK_NS, TILTED, Follower, estimate, face_of
 
 
-def begin(parameters: Docking, gap_m: float, comes: bool = True) -> tuple[DockingSequence, np.ndarray, np.ndarray]:
+def begin(parameters: Docking, gap_m: float, target_approaches: bool = True) -> tuple[DockingSequence, np.ndarray, np.ndarray]:
     """Returns a sequence and the positions of target and active body, `gap_m` apart along the target's +x."""
     target, active = (assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [m]) for m in (0, 1))
     plan = plan_dock(DockRequest(1, 1, 0, 0), active, target, [load_vehicle("modcube")] * 2)
-    sequence = DockingSequence(plan, active, target, parameters, 0, comes)
+    sequence = DockingSequence(plan, active, target, parameters, 0, target_approaches)
     place = target.r_bm[0] + plan.place_t - active.r_bm[0]
     return sequence, np.zeros(3), place + np.array([gap_m, 0.0, 0.0])
 
@@ -48,7 +48,7 @@ def test_quarter_turns_are_counted_about_the_targets_face_outwards(
 @pytest.mark.parametrize("gap_m", [0.02, 0.12, 0.2, 0.6])
 @pytest.mark.parametrize("parameters", [Docking(), PAPER.docking])
 def test_dock_that_fails_ends_apart_however_near_it_began(parameters: Docking, gap_m: float) -> None:
-    sequence, p_t, p_a = begin(parameters, gap_m, comes=False)
+    sequence, p_t, p_a = begin(parameters, gap_m, target_approaches=False)
     for tick in range(1, 40_000):
         steering = sequence.step(tick * TICK_NS, estimate(p_a), estimate(p_t), NEITHER)
         if sequence.stage in (Stage.FAILED, Stage.ABORTED) and steering.is_apart:
@@ -70,7 +70,7 @@ def test_target_comes_half_of_the_way_and_is_told_once(approach: str) -> None:
 
 
 def test_target_that_is_not_free_is_not_moved_and_the_line_goes_all_the_way() -> None:
-    sequence, p_t, p_a = begin(PAPER.docking, 0.5, comes=False)
+    sequence, p_t, p_a = begin(PAPER.docking, 0.5, target_approaches=False)
     steering = sequence.step(TICK_NS, estimate(p_a), estimate(p_t), NEITHER)
     assert steering.meets is None
     for tick in range(2, 3000):
@@ -135,7 +135,7 @@ def test_pair_is_led_so_that_its_module_stands_before_the_face_of_a_tilted_pair(
 
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_tilted_target_comes_half_of_the_way_in_the_world(approach: str) -> None:
-    dock = Follower(Docking(approach=approach), DRIFT, comes=True)
+    dock = Follower(Docking(approach=approach), DRIFT, target_approaches=True)
     dock.astray(sideways_m=0.1)
     centre = dock.face - 0.5 * PITCH_M * dock.outward
     r_a = dock.active.r_bm[1].copy()

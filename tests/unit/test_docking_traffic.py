@@ -30,7 +30,7 @@ def room(at: Place) -> Wish:
 def dock(request: DockRequest, began: Place, stage: Stage, makes_room: bool = False) -> Dock:
     active, target = request.module, request.target_module
     plan = plan_dock(request, BODIES[active], BODIES[target], VEHICLES)
-    sequence = DockingSequence(plan, BODIES[active], BODIES[target], STAGED, 0, comes=False)
+    sequence = DockingSequence(plan, BODIES[active], BODIES[target], STAGED, 0, target_approaches=False)
     sequence.stage, sequence.makes_room = stage, makes_room
     pair = FacePair(target, request.target_face, active, request.face, plan.place_t, plan.q_ta)
     return Dock(sequence, PairDetector(pair, STAGED), active, target, Prepared(request, plan, ()), room(began), set())

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
-from firmware_py.core.docking_way import WAY_SLACK, Way, first_met, nearest_pass, obstacle, way_of_active, way_of_target
+from firmware_py.core.docking_way import WAY_SLACK, Way, first_blocking_module, nearest_pass, obstacle, way_of_active, way_of_target
 from firmware_py.core.rotations import from_euler, rotate
 from firmware_py.core.types import DockRequest
 from firmware_py.description.parameters import Docking
@@ -77,7 +77,7 @@ def way_past(third_m: tuple[float, ...], length_m: float, cells: list[tuple[int,
     vehicle = load_vehicle("modcube")
     body, third = assemble(cells, [0] * len(cells), [vehicle] * len(cells)), assemble([(0, 0, 0)], [0], [vehicle], [9])
     half = np.array([0.5 * length_m, 0.0, 0.0])
-    return first_met(Way(body, -half, LEVEL, half, LEVEL, PITCH_M), [(third, estimate(np.array(third_m)))], STAGED, math.inf)
+    return first_blocking_module(Way(body, -half, LEVEL, half, LEVEL, PITCH_M), [(third, estimate(np.array(third_m)))], STAGED, math.inf)
 
 
 @pytest.mark.parametrize("along_m", np.linspace(-10.0, 10.0, 9).tolist())
@@ -110,7 +110,7 @@ def test_way_of_a_tilted_pair_leads_its_module_before_the_face_of_the_other(gap_
 
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_way_of_a_target_that_is_looked_at_is_the_one_that_it_is_told_to_come(approach: str) -> None:
-    dock = Follower(Docking(approach=approach), comes=True)
+    dock = Follower(Docking(approach=approach), target_approaches=True)
     dock.astray(sideways_m=0.2)
     way = way_of_active(dock.plan, dock.active, dock.at, dock.target, dock.there, STAGED.standoff_m if approach == "staged" else 0.0)
     theirs = way_of_target(dock.plan, way, dock.target, dock.there)

@@ -149,10 +149,11 @@ def test_magnets_of_every_face_that_will_meet_pull_in_a_dock_and_let_go_with_it(
     states = tank.pipeline.formation.docking.relays.states
     assert [(state[2], state[3]) for state in states] == [(1, 0), (1, 0), (0, 1), (0, 1)]
     tank.run(0.02)
-    assert not any(chain._is_free() for chain in tank.pipeline.formation.chains), "no thruster is judged by a motion that magnets shape"
+    pipelines = tank.pipeline.formation.pipelines
+    assert not any(pipeline._is_free() for pipeline in pipelines), "no thruster is judged by a motion that magnets shape"
     tank.run(0.1, Request(Action.SET_MODE, 2, Mode.POSHOLD))
     assert [sum(state) for state in tank.pipeline.formation.docking.relays.states] == [1] * 4, "the pairs hold"
-    assert all(chain._is_free() for chain in tank.pipeline.formation.chains)
+    assert all(pipeline._is_free() for pipeline in tank.pipeline.formation.pipelines)
 
 
 WANTED = Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2))
@@ -237,7 +238,7 @@ def test_dock_in_whose_place_another_was_asked_for_before_it_was_planned_never_b
     first = len(tank.outputs)
     outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 2, 2, 3)))
     assert {(dock.module_a, dock.module_b) for each in tank.outputs[first:] for dock in each.docks} == {(2, 1)}
-    assert tank.pipeline.formation.chains[0].guidance._goal is None, "nor does its target come"
+    assert tank.pipeline.formation.pipelines[0].guidance._goal is None, "nor does its target come"
     assert outputs.records[1].mode == Mode.DOCK and tank.when("dock refused: another was asked for")
 
 

@@ -269,17 +269,17 @@ def test_mode_is_refused_while_a_fail_safe_would_leave_it_at_once(name: str, mod
     level = Level(getattr(P, f"{name}_action"))
     refused = mode in COUNTS.get(name, set(Mode)) and mode not in PERMITTED[level]
     words = [Watch(ROWS[name], P).words(bad(name))]
-    assert failsafes.against(mode, bad(name)) == (words if refused else [])
-    assert failsafes.against(mode, GOOD) == []
+    assert failsafes.reasons_against(mode, bad(name)) == (words if refused else [])
+    assert failsafes.reasons_against(mode, GOOD) == []
     if name not in YES:
-        assert failsafes.against(mode, spoilt(name, getattr(P, f"{name}_limit"))) == []
+        assert failsafes.reasons_against(mode, spoilt(name, getattr(P, f"{name}_limit"))) == []
 
 
 def test_mode_is_permitted_as_soon_as_the_cause_is_gone_unless_it_is_latched() -> None:
     for name, stays in (("leak", True), ("cabin_hot", False)):
         failsafes = Failsafes(quick(name))
         failsafes.step(bad(name), Mode.AUTO, False, True)
-        assert bool(failsafes.against(Mode.AUTO, at(GOOD, 0.1))) is stays
+        assert bool(failsafes.reasons_against(Mode.AUTO, at(GOOD, 0.1))) is stays
 
 
 def test_row_needs_neither_limit_nor_mode() -> None:

@@ -56,7 +56,7 @@ def test_what_was_asked_for_in_the_world_before_is_forgotten_and_what_comes_with
     flight.run(1.0, health=UPRIGHT)
     flight.do(Effect.TAKE_POINT, Mode.ALT_HOLD, rest_at(ZERO, LEVEL))
     flight.estimate = there
-    flight.guidance.look(there, GOOD)
+    flight.guidance.drop_stale_goals(there, GOOD)
     flight.do(Effect.HOLD_AT, Mode.POSHOLD, rest_at(np.array([4.0, -3.0, 1.4]), LEVEL))
     assert flight.run(20.0).p_wb[0] == pytest.approx(4.0, abs=0.01)
     other = Flight()
@@ -64,7 +64,7 @@ def test_what_was_asked_for_in_the_world_before_is_forgotten_and_what_comes_with
     other.run(1.0, health=UPRIGHT)
     other.do(Effect.TAKE_POINT, Mode.ALT_HOLD, rest_at(ZERO, LEVEL))
     other.estimate = there
-    other.guidance.look(there, GOOD)
+    other.guidance.drop_stale_goals(there, GOOD)
     other.do(Effect.ENTER_MODE, Mode.GUIDED)
     assert other.run(5.0).p_wb[0] == pytest.approx(5.0, abs=0.01)
 

@@ -120,7 +120,7 @@ def test_force_changes_no_faster_than_the_slew_limit(rich: Body, slew: float, si
 
 def test_thrusters_that_pass_to_another_body_change_slowly_for_a_fifth_of_a_second(rich: Body) -> None:
     limiter = Limiter(rich, parameters.Limiter(), DT)
-    limiter.ease(np.full(16, 4.0))
+    limiter.continue_from(np.full(16, 4.0))
     forces = np.array([4.0, *(limiter.step(np.full(16, wanted), True, NOMINAL)[0][0] for wanted in [-8.0, 10.0] * 10 + [-8.0])])
     np.testing.assert_allclose(np.abs(np.diff(forces[:21])), 0.8, atol=1e-12)
     assert forces[20] - forces[21] == pytest.approx(2.0)
@@ -128,13 +128,13 @@ def test_thrusters_that_pass_to_another_body_change_slowly_for_a_fifth_of_a_seco
 
 def test_eased_thrusters_change_no_faster_than_the_slew_limit_either(rich: Body) -> None:
     limiter = Limiter(rich, parameters.Limiter(slew_n_per_s=10.0), DT)
-    limiter.ease(np.zeros(16))
+    limiter.continue_from(np.zeros(16))
     np.testing.assert_allclose(limiter.step(np.full(16, 5.0), True, NOMINAL)[0], 0.1)
 
 
 def test_eased_thrusters_stop_at_once_when_disarmed(rich: Body) -> None:
     limiter = Limiter(rich, parameters.Limiter(), DT)
-    limiter.ease(np.full(16, 4.0))
+    limiter.continue_from(np.full(16, 4.0))
     force, command = limiter.step(np.full(16, 4.0), False, NOMINAL)
     assert not force.any() and not command.any()
 
@@ -401,29 +401,29 @@ def test_thrusters_have_what_the_magnets_leave(body: Body, magnets_w: float) -> 
 def test_room_is_what_passes_when_all_is_asked_for(rich: Body, volts: float, share: float) -> None:
     limiter = Limiter(rich, replace(QUICK, force_share=share), 1.0)
     voltage = np.array([volts, 12.0])
-    room = limiter.room(voltage)
-    for wanted, bound in ((-100.0, room.low_n), (100.0, room.high_n)):
+    limits = limiter.limits(voltage)
+    for wanted, bound in ((-100.0, limits.low_n), (100.0, limits.high_n)):
         force, _ = limiter.step(np.full(16, wanted), True, voltage)
         np.testing.assert_array_equal(force, bound)
 
 
 def test_room_has_what_the_magnets_leave_of_each_supply(body: Body) -> None:
     limiter = Limiter(replace(body, supply_power_w=np.array([40.0, 50.0])), QUICK, 1.0)
-    np.testing.assert_array_equal(limiter.room(NOMINAL).supply_w, [40.0, 50.0])
+    np.testing.assert_array_equal(limiter.limits(NOMINAL).supply_w, [40.0, 50.0])
     limiter.magnets[1].power_w = 6.0
-    np.testing.assert_array_equal(limiter.room(NOMINAL).supply_w, [40.0, 44.0])
+    np.testing.assert_array_equal(limiter.limits(NOMINAL).supply_w, [40.0, 44.0])
 
 
 def test_room_is_made_anew_when_something_has_changed_and_only_then(body: Body) -> None:
     limiter = Limiter(body, QUICK, 1.0)
-    first = limiter.room(NOMINAL)
-    assert limiter.room(NOMINAL.copy()) is first
-    sagged = limiter.room(np.array([9.0, 12.0]))
+    first = limiter.limits(NOMINAL)
+    assert limiter.limits(NOMINAL.copy()) is first
+    sagged = limiter.limits(np.array([9.0, 12.0]))
     assert sagged is not first and np.all(sagged.high_n[:8] < first.high_n[:8])
     limiter.step(np.zeros(16), True, NOMINAL)
-    np.testing.assert_array_equal(limiter.room(NOMINAL).high_n, first.high_n)
+    np.testing.assert_array_equal(limiter.limits(NOMINAL).high_n, first.high_n)
     limiter.retune(replace(QUICK, force_share=0.5))
-    np.testing.assert_array_equal(limiter.room(NOMINAL).high_n, 0.5 * first.high_n)
+    np.testing.assert_array_equal(limiter.limits(NOMINAL).high_n, 0.5 * first.high_n)
 
 
 def test_limits_are_made_of_these_numbers() -> None:

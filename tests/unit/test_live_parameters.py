@@ -40,7 +40,7 @@ def test_value_out_of_range_is_refused_in_words_and_changes_nothing(flying: Pipe
 
 def test_limits_set_in_flight_are_those_of_every_stage_from_that_tick_on(flying: Pipeline) -> None:
     """A stage that kept the values it was built with would continue with the old limits."""
-    chain = flying.formation.chains[0]
+    pipeline = flying.formation.pipelines[0]
     wanted = {
         "limiter.force_share": 0.2, "limiter.slew_n_per_s": 20.0, "fence.east_m": 0.1, "failsafes.ground_lost_limit": 0.5,
         "failsafes.leak_action": 5, "supervision.arm_sigma_m": 0.5, "steering.speed_m_s": 0.07, "faults.dead_count": 9,
@@ -48,9 +48,9 @@ def test_limits_set_in_flight_are_those_of_every_stage_from_that_tick_on(flying:
     requests = [Request(Action.SET_PARAMETER, 0, pair) for pair in wanted.items()]
     outputs = step(flying, 120, [*requests, Request(Action.GROUND_ALIVE, 0)])
     assert [event.text for event in outputs.events] == []
-    assert chain.health.now.outside_m == pytest.approx(0.1, abs=0.01)
-    full_n = chain.body.thrusters.f_max
-    forces, _ = chain.limiter.step(10.0 * full_n, True, np.array([12.0]))
+    assert pipeline.health.now.outside_m == pytest.approx(0.1, abs=0.01)
+    full_n = pipeline.body.thrusters.f_max
+    forces, _ = pipeline.limiter.step(10.0 * full_n, True, np.array([12.0]))
     assert np.all(forces <= 0.2 * full_n + 1e-9) and np.all(np.abs(forces - outputs.records[0].commanded_n) <= 0.2 + 1e-9)
     said = []
     for tick in range(121, 175):
@@ -64,10 +64,10 @@ def test_limits_set_in_flight_are_those_of_every_stage_from_that_tick_on(flying:
 
 
 def test_share_of_a_thruster_test_may_be_set_in_flight(flying: Pipeline) -> None:
-    chain = flying.formation.chains[0]
+    pipeline = flying.formation.pipelines[0]
     step(flying, 120, [Request(Action.SET_PARAMETER, 0, ("steering.test_share", 0.1))])
-    chain.motor_test.start((2, 1.0, 1.0), 0)
-    np.testing.assert_allclose(chain.motor_test.step(0)[2], 0.1 * chain.body.thrusters.f_max[2])
+    pipeline.motor_test.start((2, 1.0, 1.0), 0)
+    np.testing.assert_allclose(pipeline.motor_test.step(0)[2], 0.1 * pipeline.body.thrusters.f_max[2])
 
 
 def test_whole_numbers_set_in_flight_are_flown_with(flying: Pipeline) -> None:

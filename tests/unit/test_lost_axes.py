@@ -58,16 +58,16 @@ def test_force_that_is_lost_whole_costs_no_moment(name: str, offset_m: float) ->
 def test_healthy_robot_that_lacks_an_axis_makes_the_force_that_it_can(wanted: list[float], made: list[float]) -> None:
     """BlueROV2 cannot pitch, and its surge pitches it a little. Regression: in saturation nothing was left of the force."""
     body = assemble_vehicle(load_vehicle("bluerov2"))
-    chain = BodyPipeline(body, Parameters(), TICK_NS)
-    assert chain.faults.now.lost_axes == 0 and np.linalg.matrix_rank(body.thrusters.matrix) == 5
-    thrust = chain._allocate(np.array(wanted, dtype=np.float64), 0)
+    pipeline = BodyPipeline(body, Parameters(), TICK_NS)
+    assert pipeline.faults.now.lost_axes == 0 and np.linalg.matrix_rank(body.thrusters.matrix) == 5
+    thrust = pipeline._allocate(np.array(wanted, dtype=np.float64), 0)
     np.testing.assert_allclose(thrust.achieved[:2], np.array(made), rtol=0.02)
     assert np.abs(thrust.achieved[3:]).max() < 0.02 * made[0]
 
 
 def test_robot_of_five_thrusters_makes_the_force_that_it_can() -> None:
     """Girona 500 cannot roll, and its sway rolls it a little. Regression: in saturation nothing was left of the force."""
-    chain = BodyPipeline(assemble_vehicle(load_vehicle("girona500")), Parameters(), TICK_NS)
-    thrust = chain._allocate(np.array([600.0, 100.0, 0.0, 0.0, 0.0, 0.0]), 0)
+    pipeline = BodyPipeline(assemble_vehicle(load_vehicle("girona500")), Parameters(), TICK_NS)
+    thrust = pipeline._allocate(np.array([600.0, 100.0, 0.0, 0.0, 0.0, 0.0]), 0)
     np.testing.assert_allclose(thrust.achieved[:3], [269.1, 44.85, 0.0], atol=0.5)
     assert np.abs(thrust.achieved[3:]).max() < 1.0

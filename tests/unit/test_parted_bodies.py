@@ -15,7 +15,7 @@ def test_parts_of_a_broken_body_are_as_broken_as_it_was() -> None:
     tank = Docked(RING[:2])
     tank.run(0.5)
     tank.run(1.0, Request(Action.GROUND_ALIVE), Request(Action.ARM))
-    whole = tank.pipeline.formation.chains[0]
+    whole = tank.pipeline.formation.pipelines[0]
     whole.faults._lose(3, "stands still")
     whole.allocator.set_alive(whole.faults.now.alive)
     tank.cabin_pa[0] = 130e3
@@ -23,10 +23,10 @@ def test_parts_of_a_broken_body_are_as_broken_as_it_was() -> None:
     tank.lose(1)
     tank.run(1.0)
     assert tank.shape == [(0,), (1,)]
-    hurt, sound = tank.pipeline.formation.chains
+    hurt, sound = tank.pipeline.formation.pipelines
     assert hurt.faults.now.dead == (3,) and sound.faults.now.dead == ()
     assert hurt.health.now.cabin_change_pa == 130e3 - 101_325.0 and sound.health.now.cabin_change_pa == 0.0
-    assert all(chain.supervisor.is_on("cabin_pressure") and chain.supervisor.mode == Mode.SURFACE for chain in (hurt, sound))
+    assert all(pipeline.supervisor.is_on("cabin_pressure") and pipeline.supervisor.mode == Mode.SURFACE for pipeline in (hurt, sound))
     assert tank.outputs[-1].modules[0].thrusters[3] == 0.0 and hurt.supervisor.is_on("thruster_lost")
     assert hurt.health.now.ground_age_s == sound.health.now.ground_age_s == pytest.approx(4.49, abs=0.02)
     tank.run(0.1, Request(Action.DISARM, 0))
@@ -42,7 +42,7 @@ def test_body_that_was_prepared_with_other_gains_flies_with_those_of_now() -> No
     tank.run(0.05, Request(Action.SET_PARAMETER, 0, ("control.position_bandwidth", 1.5)))
     tank.run(0.6)
     assert tank.shape == [(0,), (1,)]
-    assert all(chain.parameters.control.position_bandwidth == 1.5 for chain in tank.pipeline.formation.chains)
+    assert all(pipeline.parameters.control.position_bandwidth == 1.5 for pipeline in tank.pipeline.formation.pipelines)
 
 
 @pytest.mark.slow
@@ -50,22 +50,22 @@ def test_magnets_of_a_joint_rest_when_their_account_is_empty_and_take_power_whil
     parameters = Parameters().replace("limiter.relay_on_s", 2.0).replace("limiter.relay_duty", 0.25)
     tank = Docked(RING[:2], parameters)
     tank.run(1.0)
-    assert [magnets.power_w for magnets in tank.pipeline.formation.chains[0].limiter.magnets] == [6.0, 6.0]
+    assert [magnets.power_w for magnets in tank.pipeline.formation.pipelines[0].limiter.magnets] == [6.0, 6.0]
     tank.run(3.0)
     sent = [(tick, outputs.modules[0].relays) for tick, outputs in enumerate(tank.outputs) if outputs.modules[0].relays is not None]
     pulling = {tick for tick, states in sent if any(states)}
     resting = sorted({tick for tick, states in sent if not any(states)})
     assert resting and resting[0] == pytest.approx(2.0 / 0.75 / 0.01, abs=2), "sent at once, not with the next tenth of a second"
-    assert not pulling & set(resting) and tank.pipeline.formation.chains[0].limiter.magnets[0].power_w == 0.0
+    assert not pulling & set(resting) and tank.pipeline.formation.pipelines[0].limiter.magnets[0].power_w == 0.0
 
 
 def test_parted_modules_magnets_keep_their_accounts() -> None:
     tank = Docked(RING[:2], Parameters().replace("limiter.relay_on_s", 60.0).replace("limiter.relay_duty", 0.01))
     tank.fly()
-    before = [list(magnets._left_s) for magnets in tank.pipeline.formation.chains[0].limiter.magnets]
+    before = [list(magnets._left_s) for magnets in tank.pipeline.formation.pipelines[0].limiter.magnets]
     tank.lose(1)
     tank.run(1.0)
-    after = [list(chain.limiter.magnets[0]._left_s) for chain in tank.pipeline.formation.chains]
+    after = [list(pipeline.limiter.magnets[0]._left_s) for pipeline in tank.pipeline.formation.pipelines]
     assert min(before[0]) < 59.0 and min(after[0]) < min(before[0]) and min(after[1]) < min(before[1])
 
 

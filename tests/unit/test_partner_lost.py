@@ -322,9 +322,9 @@ def test_undock_that_is_asked_for_while_the_partner_is_being_lost_parts_once() -
 def test_estimate_of_a_part_is_as_old_as_that_of_the_whole() -> None:
     tank = Docked(RING[:2])
     tank.fly()
-    (chain,) = tank.pipeline.formation.chains
-    fresh = tank.pipeline.chain_of(chain.body)
-    motion = chain.estimator.motion
+    (pipeline,) = tank.pipeline.formation.pipelines
+    fresh = tank.pipeline.body_pipeline_of(pipeline.body)
+    motion = pipeline.estimator.motion
     old = fresh.estimator.restart(5_000_000_000, motion._replace(tag_ns=2_000_000_000))
     assert old.ready and old.tag_age_ns == 3_000_000_000
     assert not fresh.estimator.restart(5_000_000_000, motion._replace(accepted=0)).ready

@@ -156,7 +156,7 @@ def test_battery_reading_of_nothing_changes_no_command(tank: Tank) -> None:
     """Neither at once nor through the smoothed voltage."""
     tank.run(0.5)
     tank.run(1.0, Request(Action.ARM))
-    before = tank.pipeline.formation.chains[0].supply.voltage_v.copy()
+    before = tank.pipeline.formation.pipelines[0].supply.voltage_v.copy()
     hear = tank._hear
 
     def broken(tick: int) -> list[ModuleInputs]:
@@ -166,7 +166,7 @@ def test_battery_reading_of_nothing_changes_no_command(tank: Tank) -> None:
 
     tank._hear = broken  # type: ignore[method-assign]
     tank.run(0.3)
-    np.testing.assert_array_equal(tank.pipeline.formation.chains[0].supply.voltage_v, before)
+    np.testing.assert_array_equal(tank.pipeline.formation.pipelines[0].supply.voltage_v, before)
 
 
 # ---------------------------------------------------------------- fleets

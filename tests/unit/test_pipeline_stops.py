@@ -99,13 +99,13 @@ def test_robot_that_lost_an_axis_trusts_its_thrusters_again_once_it_is_disarmed(
     """A thruster that no longer turns is found again within half a second of flight."""
     tank.run(0.5)
     tank.run(0.5, Request(Action.ARM))
-    chain = tank.pipeline.formation.chains[0]
+    pipeline = tank.pipeline.formation.pipelines[0]
     for thruster in (4, 7):
-        chain.faults._lose(thruster, "stands still")
-    chain.allocator.set_alive(chain.faults.now.alive)
-    assert tank.run(0.1).records[0].state == State.ARMED and chain.health.now.lost_axes == 1
+        pipeline.faults._lose(thruster, "stands still")
+    pipeline.allocator.set_alive(pipeline.faults.now.alive)
+    assert tank.run(0.1).records[0].state == State.ARMED and pipeline.health.now.lost_axes == 1
     tank.run(0.1, Request(Action.DISARM))
-    assert chain.faults.now.dead == () and tank.run(3.0, Request(Action.ARM)).records[0].state == State.ARMED
+    assert pipeline.faults.now.dead == () and tank.run(3.0, Request(Action.ARM)).records[0].state == State.ARMED
     assert tank.outputs[-1].modules[0].thrusters.all(), "and they are used again"
 
 

@@ -64,7 +64,7 @@ def test_what_is_undocked_glides_to_no_third_body(ahead: bool, behind: bool, gli
     held = [records[0].setpoint.p_wb - half_w, records[0].setpoint.p_wb + half_w]
     tank.run(4.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
     assert tank.shape == [(0,), (1,), (2, 3), (4, 5)]
-    holds = [chain.guidance._held().p_wb for chain in tank.pipeline.formation.chains[:2]]
+    holds = [pipeline.guidance._held().p_wb for pipeline in tank.pipeline.formation.pipelines[:2]]
     gone_m = np.linalg.norm(np.array(holds) - held, axis=1)
     assert gone_m == pytest.approx([standoff_m * (module == glides) for module in (0, 1)], abs=0.01)
 
@@ -77,7 +77,7 @@ def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> 
     assert [sum(state == 2 for state in states) for states in tank.pipeline.formation.docking.relays.states] == [0, 1, 1, 2]
     outputs = tank.run(5.0)
     assert tank.shape == [(0, 1, 2), (3,)]
-    rest, corner = (chain.guidance._glider.at.p_wb for chain in tank.pipeline.formation.chains)
+    rest, corner = (pipeline.guidance._glider.at.p_wb for pipeline in tank.pipeline.formation.pipelines)
     assert outputs.records[1].mode == Mode.POSHOLD and np.linalg.norm(corner - rest) > 0.3
     assert [max(states) for states in tank.pipeline.formation.docking.relays.states] == [1, 1, 1, 0]
 
