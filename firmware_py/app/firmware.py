@@ -58,7 +58,7 @@ class Firmware:
 
     def frames(self, outputs: Outputs) -> list[BusFrame]:
         """The frames to send in a tick. A module's thrusters are commanded only after its first MCU_STATUS."""
-        return self.encoder.frames(outputs, self.collector.unmet)
+        return self.encoder.frames(outputs, self.collector.without_status)
 
     def tick(self, inputs: Inputs) -> Outputs:
         """Steps the fleet. Finished results of the worker enter `inputs`; new preparation requests go to the worker."""

@@ -157,7 +157,7 @@ class GroundSide:
         station.signing.advance(self._unix_now_ns())
         if self.keeper is not None:
             station.picture.times = times_of(self.keeper)
-        station.spare(self.links.busy())
+        station.set_busy(self.links.busy())
         while self._ticks:
             inputs, outputs = self._ticks.popleft()
             station.observe(inputs, outputs, self._pipeline.bodies)

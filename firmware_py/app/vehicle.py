@@ -25,7 +25,7 @@ from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
-from firmware_py.ground.stored_parameters import laid_over, stored_line
+from firmware_py.ground.stored_parameters import stored_line, with_stored_values
 from firmware_py.runtime.clock import boot_id, unix_ns
 from firmware_py.runtime.interrupts import endings_of_a_run, handled
 from firmware_py.runtime.log_folder import make_log_folder
@@ -137,7 +137,7 @@ def run_vehicle(
         ground: links to ground stations; parameters that they stored earlier are laid over `parameters`.
     """
     store = ground.parameter_file if ground is not None else None
-    laid = laid_over(parameters, store)
+    laid = with_stored_values(parameters, store)
     release_compiler()
     with ExitStack() as stack:
         teller = Teller(say)  # before this thread takes its priority, like every thread below that does not belong to the loop

@@ -39,7 +39,7 @@ class InputCollector:
         faults: frames that passed the codec's checks and were not used, by kind: `module` (not in the fleet),
             `tag_unpaired`, `tag_stale`, `tag_future`, `sensor` (its status says fault or stale), `foreign_sync` and
             `foreign_command` (another node controls this bus).
-        unmet: fleet indices of modules that have not sent MCU_STATUS yet.
+        without_status: fleet indices of modules that have not sent MCU_STATUS yet.
     """
 
     def __init__(self, fleet: Fleet, codec: Codec) -> None:
@@ -53,7 +53,7 @@ class InputCollector:
         self._estop = self._foreign_sync = self._foreign_command = False
         kinds = ("module", "tag_unpaired", "tag_stale", "tag_future", "sensor", "foreign_sync", "foreign_command")
         self.faults: dict[str, int] = dict.fromkeys(kinds, 0)
-        self.unmet = set(range(len(fleet.module)))
+        self.without_status = set(range(len(fleet.module)))
         named = self._make_handlers()
         self._handlers = [named.get(message.name) for message in codec.messages]
         self._names = [message.name for message in codec.messages]
@@ -167,7 +167,7 @@ class InputCollector:
         self._status_ticks[index] = int(tick)
         if module.mcu_state != MCU_ESTOP:  # a later status in the same tick must not hide an e-stop
             module.mcu_state = int(state)
-        self.unmet.discard(index)
+        self.without_status.discard(index)
 
     def _take_tag(self, index: int, module: ModuleInputs, row: Row) -> None:
         """Pairs the two halves of an observation, which share the counter; nothing else marks them as belonging together."""
@@ -248,11 +248,12 @@ class OutputEncoder:
         frame = self._sync.encode(0, (tick & 0xFFFFFFFF,))
         return [(bus, frame) for bus in self._buses]
 
-    def frames(self, outputs: Outputs, unmet: Collection[int] = ()) -> list[tuple[int, Frame]]:
+    def frames(self, outputs: Outputs, without_status: Collection[int] = ()) -> list[tuple[int, Frame]]:
         """Returns the frames of one tick: ESTOP when due, then for every module its thrusters and, when due, its docking relays.
 
         Args:
-            unmet: modules whose thrusters are not commanded yet: a command would make them release an e-stop that is not known here.
+            without_status: modules whose thrusters are not commanded yet: a command would make them release an e-stop that is not known
+                here.
         """
         frames: list[tuple[int, Frame]] = []
         if self._estop_is_due(outputs):
@@ -263,7 +264,7 @@ class OutputEncoder:
             mode = int(command.armed)
             shares = command.thrusters.tolist()
             shares += [0.0] * (CHANNELS - len(shares))
-            if index not in unmet:
+            if index not in without_status:
                 frames.append((bus, half_a.encode(number, (*shares[:THRUSTERS_OF_A_FRAME], mode), counter)))
                 frames.append((bus, half_b.encode(number, (*shares[THRUSTERS_OF_A_FRAME:], mode), counter)))
             if command.relays is not None:

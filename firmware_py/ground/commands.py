@@ -124,7 +124,7 @@ class CommandService:
         if not self._system.body_is_known and not _stops(command):
             answer: Answer = self._refuse(command)
         elif missing := [n for n in range(1, _NEEDED.get(command.number, 0) + 1) if not math.isfinite(command.parameters[n - 1])]:
-            answer = self._unless(f"its parameter {missing[0]} is no number", f"command {command.number}", DENIED)
+            answer = self._accept_or_refuse(f"its parameter {missing[0]} is no number", f"command {command.number}", DENIED)
         else:
             answer = UNSUPPORTED if handler is None else handler(command)
         if answer is not None:
@@ -144,7 +144,7 @@ class CommandService:
         self._pending.append(Pending(command, action, is_done, command.arrival.time_ns + DECISION_NS))
         return None
 
-    def _unless(self, reason: str, what: str, refusal: int) -> Answer:
+    def _accept_or_refuse(self, reason: str, what: str, refusal: int) -> Answer:
         """Returns ACCEPTED if `reason` is empty; otherwise reports the reason and returns `refusal`."""
         if reason:
             self._system.say(WARNING, f"{what} refused: {reason}")
@@ -161,7 +161,7 @@ class CommandService:
 
     def _set_mode(self, command: Command) -> Answer:
         identity = self._system.subject.identity
-        mode = identity.mode_of_command(command.parameters[1], command.parameters[2]) if _names_mode(command) else None
+        mode = identity.mode_of_command(command.parameters[1], command.parameters[2]) if _has_custom_mode(command) else None
         number = None
         if mode is not None and identity.pairs:
             number = int(command.parameters[1]) << 16 | int(command.get(3)) << 24
@@ -171,7 +171,7 @@ class CommandService:
         """Takes the old SET_MODE message, which has no acknowledgement of its own."""
         custom = arrival.message["custom_mode"]
         command = Command(SET_MODE, (arrival.message["base_mode"], *[math.nan] * 6), arrival)
-        mode = self._system.subject.identity.mode(custom) if _names_mode(command) else None
+        mode = self._system.subject.identity.mode(custom) if _has_custom_mode(command) else None
         answer = self._enter(command, mode, custom) if self._system.body_is_known else self._refuse(command)
         if answer is not None:
             self._acknowledge(command, answer)
@@ -194,7 +194,7 @@ class CommandService:
     # ------------------------------------------------------------ missions
 
     def _start_mission(self, command: Command, first: int | None) -> Answer:
-        return self._unless(self._missions.start(first), "mission", TEMPORARILY_REJECTED)
+        return self._accept_or_refuse(self._missions.start(first), "mission", TEMPORARILY_REJECTED)
 
     def _pause(self, command: Command) -> Answer:
         if command.get(1) >= 0.5:
@@ -202,21 +202,21 @@ class CommandService:
         return self._enter(command, Mode.POSHOLD)
 
     def _set_current(self, command: Command) -> Answer:
-        return self._unless(self._missions.jump(int(command.get(1))), "mission", DENIED)
+        return self._accept_or_refuse(self._missions.jump(int(command.get(1))), "mission", DENIED)
 
     def _change_speed(self, command: Command) -> Answer:
         if command.get(1) in ONE_WAY_SPEEDS:
-            return self._unless("there is none of climbing or descending alone", "speed", DENIED)
-        return self._unless(self._missions.set_speed(command.get(2)), "speed", DENIED)
+            return self._accept_or_refuse("there is none of climbing or descending alone", "speed", DENIED)
+        return self._accept_or_refuse(self._missions.set_speed(command.get(2)), "speed", DENIED)
 
     def _reposition(self, command: Command) -> Answer:
         latitude, longitude, altitude = command.parameters[4:7]
         if not all(map(math.isfinite, (latitude, longitude, altitude))):
-            return self._unless("it names no place on the earth", "reposition", DENIED)
-        if self._system.is_one_of_several(command.arrival):
-            return self._unless("it is for all, and there are several bodies", "reposition", DENIED)
+            return self._accept_or_refuse("it names no place on the earth", "reposition", DENIED)
+        if self._system.is_ambiguous_broadcast(command.arrival):
+            return self._accept_or_refuse("it is for all, and there are several bodies", "reposition", DENIED)
         reason = self._missions.go_to(latitude, longitude, altitude, command.parameters[3], command.get(1))
-        return self._unless(reason, "reposition", TEMPORARILY_REJECTED)
+        return self._accept_or_refuse(reason, "reposition", TEMPORARILY_REJECTED)
 
     # ------------------------------------------------------------ safety, docking, thrusters
 
@@ -237,7 +237,7 @@ class CommandService:
         picture = self._system.subject.picture  # of the whole fleet, which one process controls
         reason = "a body is armed" if picture.any_armed else "the e-stop is not cleared" if picture.any_stopped else ""
         self.reboot_asked = self.reboot_asked or not reason
-        return self._unless(reason, "reboot", DENIED)
+        return self._accept_or_refuse(reason, "reboot", DENIED)
 
     def _dock(self, command: Command, action: Action) -> Answer:
         module, face, target, target_face, turns = (int(command.get(i)) for i in range(1, 6))
@@ -247,7 +247,7 @@ class CommandService:
             ("target face", target_face, 0, FACES - 1), ("quarter turns", turns, 0, QUARTERS - 1),
         )  # fmt: skip
         if reason or module == target:
-            return self._unless(reason or f"module {module} and itself", action.name.lower(), DENIED)
+            return self._accept_or_refuse(reason or f"module {module} and itself", action.name.lower(), DENIED)
         request = DockRequest(module, face, target, target_face, turns, command.get(6) >= 0.5)
         s = self._system.subject
         parts = action == Action.UNDOCK and s.picture.leader(module) == s.picture.leader(target)
@@ -266,14 +266,14 @@ class CommandService:
         first, last = identity.first_motor, identity.first_motor + CHANNELS * len(s.modules) - 1
         reason = _outside(("motor", motor, first, last), ("throttle type", kind, 0, 1), ("throttle", throttle, low, high))
         if reason:
-            return self._unless(reason, "motor test", DENIED)
+            return self._accept_or_refuse(reason, "motor test", DENIED)
         thruster, share = motor - first, (2 * throttle - low - high) / (high - low)
         seconds = min(max(command.get(4, 1.0), 0.0), 10.0)
         is_turning = lambda: s.picture.mode(s.body) == Mode.MOTOR_DETECT and s.armed  # noqa: E731
         return self._ask(command, Action.MOTOR_TEST, (thruster, share, seconds), is_turning)
 
 
-def _names_mode(command: Command) -> bool:
+def _has_custom_mode(command: Command) -> bool:
     """Whether the custom mode counts: without CUSTOM_MODE_ENABLED it must be ignored, and flags alone select no mode here."""
     return bool(int(command.get(1)) & CUSTOM_MODE_ENABLED)
 

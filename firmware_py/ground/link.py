@@ -83,7 +83,7 @@ class Links:
                 self.counts["receive"] += 1
                 continue
             if not link.datagram:
-                self._meet(index, link.peers())
+                self._sync_peers(index, link.peers())
             for peer, data in got:
                 if data and (link.datagram or (index, peer) in self._by_peer):  # skips stream peers that left or were refused
                     yield Received(self._channel(index, peer), data, link.datagram, self._trusted[index])
@@ -129,25 +129,25 @@ class Links:
         for link in self.links:
             link.close()
 
-    def _meet(self, index: int, there: Sequence[Any]) -> None:
+    def _sync_peers(self, index: int, there: Sequence[Any]) -> None:
         """Makes a channel of every new connection before it sends anything, and removes the channels of peers that left."""
         for key in [key for key in self._by_peer if key[0] == index and key[1] not in there]:
             self._forget(*key)
         for peer in there:
             if (index, peer) in self._by_peer:
                 continue
-            full = len(self._same(index)) >= _MOST_PEERS
+            full = len(self._peers_of(index)) >= _MOST_PEERS
             if full and not self._strangers(index):
                 self.links[index].leave(peer)
             else:
                 self._channel(index, peer)
 
-    def _same(self, index: int) -> list[tuple[int, Any]]:
+    def _peers_of(self, index: int) -> list[tuple[int, Any]]:
         """Returns the keys of a link's peers, longest silent first."""
         return [key for key in self._by_peer if key[0] == index]
 
     def _strangers(self, index: int) -> list[tuple[int, Any]]:
-        return [key for key in self._same(index) if not self.channels[self._by_peer[key]].believed]
+        return [key for key in self._peers_of(index) if not self.channels[self._by_peer[key]].believed]
 
     def _channel(self, index: int, peer: Any) -> int:
         """Returns a peer's channel number. On a full link a new peer displaces the longest silent one, those never believed first."""
@@ -155,7 +155,7 @@ class Links:
         if key in self._by_peer:
             self._by_peer[key] = self._by_peer.pop(key)
         else:
-            same = self._same(index)
+            same = self._peers_of(index)
             if len(same) >= _MOST_PEERS:
                 self._forget(*(self._strangers(index) or same)[0])
             self._by_peer[key] = self._next

@@ -61,14 +61,14 @@ class LogService:
             if channel not in self._system.channels:
                 del self._listings[channel]
             elif channel not in self._system.busy:
-                self._tell(listing)
+                self._send_entries(listing)
         for channel, transfer in list(self._transfers.items()):
             if channel not in self._system.channels:
                 del self._transfers[channel]
             elif channel not in self._system.busy:
-                self._carry(transfer)
+                self._send_pieces(transfer)
 
-    def _carry(self, t: _Transfer) -> None:
+    def _send_pieces(self, t: _Transfer) -> None:
         try:
             with t.path.open("rb") as file:
                 file.seek(t.at)
@@ -91,7 +91,7 @@ class LogService:
     def _list(self, arrival: Arrival) -> None:
         self._listings[arrival.channel] = _Listing(arrival, arrival.message["end"])
 
-    def _tell(self, listing: _Listing) -> None:
+    def _send_entries(self, listing: _Listing) -> None:
         """Sends the next entries of a list. The folder is read once per list, not for each request of a flood."""
         arrival = listing.arrival
         if listing.next is None:

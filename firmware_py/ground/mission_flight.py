@@ -82,14 +82,14 @@ class _Flight:
     """A flight under way, or waiting for its plan."""
 
     legs: tuple[Leg, ...]
-    terms: tuple[Any, ...]
+    plan_inputs: tuple[Any, ...]
     """All inputs of the plan, except the start pose."""
     arrivals_s: tuple[float, ...] = ()
-    taken: int = 0
-    """System.taken when the flight was requested; while it is tracked, as of the last tick."""
+    task_changes: int = 0
+    """System.task_changes when the flight was requested; while it is tracked, as of the last tick."""
     members: tuple[int, ...] = ()
     """Fleet indices of the body's modules when the flight was requested: it is planned for these."""
-    holds: bool = False
+    hold_reached: bool = False
     """Whether the hold in which the body waits for the plan has been in force."""
     started_ns: int | None = None
     reached: int = 0
@@ -112,9 +112,9 @@ class MissionFlight:
         """Flights to be planned; the planner takes them."""
         self._serial = 0
         self._flight: _Flight | None = None
-        self._left: tuple[Leg, ...] = ()
+        self._remaining_legs: tuple[Leg, ...] = ()
         """Legs left of a paused mission: jumps already made are not repeated."""
-        self._begun_at: int | None = None
+        self._started_at_item: int | None = None
         """Item from which the mission was last started; None while a jump restarts it, perhaps from the same item."""
         self._plan_at_tick: int | None = None
         """Tick at which to request the plan; None once it is requested."""
@@ -137,9 +137,9 @@ class MissionFlight:
 
     def amend(self, items: tuple[Item, ...]) -> None:
         """Changes items of the mission while it is not flown; it resumes at its current item."""
-        self.items, self._left = items, ()
+        self.items, self._remaining_legs = items, ()
 
-    def against(self, item: Item) -> tuple[int, str]:
+    def check_fence(self, item: Item) -> tuple[int, str]:
         """Checks `item` against the present fence. Returns a MAV_MISSION_RESULT, 0 if it can be flown, and why it cannot."""
         place = item.place(self._system.subject.origin) if item.sequence >= self._first else None
         return (0, "") if place is None else beyond_fence(place, self._parameters().fence)
@@ -167,22 +167,22 @@ class MissionFlight:
             return "there is none"
         if not s.armed:
             return "the vehicle is disarmed"
-        if self._flight is not None and self._system.taken != self._flight.taken:
+        if self._flight is not None and self._system.task_changes != self._flight.task_changes:
             self._end(PAUSED)  # an earlier request gave the body another task, and the next tick would end the flight
         wanted = first
         if wanted is None:
             wanted = s.progress.current if s.progress.state == PAUSED else 0
         wanted = max(wanted, self._first)
-        if s.progress.state == ACTIVE and (first is None or wanted == self._begun_at):
+        if s.progress.state == ACTIVE and (first is None or wanted == self._started_at_item):
             return ""
-        left = self._left if first is None and s.progress.state == PAUSED else ()
+        left = self._remaining_legs if first is None and s.progress.state == PAUSED else ()
         try:
             legs = left or self._legs(wanted)
         except MissionError as error:
             return str(error)
         if not legs:
             return "nothing is left to fly"
-        s.progress.state, s.progress.current, self._begun_at = ACTIVE, legs[0].sequence, wanted
+        s.progress.state, s.progress.current, self._started_at_item = ACTIVE, legs[0].sequence, wanted
         self._begin(legs)
         return ""
 
@@ -200,9 +200,9 @@ class MissionFlight:
         self._end_if_taken()
         p = self._system.subject.progress
         if self.flies or (self._flight is not None and self._flight.replaced):
-            self._begun_at = None
+            self._started_at_item = None
             return self.start(index)
-        p.current, p.state, self._left = index, PAUSED, ()
+        p.current, p.state, self._remaining_legs = index, PAUSED, ()
         return ""
 
     def set_speed(self, speed_m_s: float) -> str:
@@ -259,7 +259,7 @@ class MissionFlight:
             if tracking and flight.started_ns is None:
                 flight.started_ns = time_ns
             if tracking:
-                flight.taken = self._system.taken  # no request so far has given the body another task
+                flight.task_changes = self._system.task_changes  # no request so far has given the body another task
                 self._advance(flight, time_ns)
             elif flight.started_ns is not None:
                 self._end(PAUSED)
@@ -270,7 +270,7 @@ class MissionFlight:
         flight = self._flight
         if flight is None or flight.started_ns is not None:
             return
-        reason = self._against_waiting(flight)
+        reason = self._reason_to_abandon(flight)
         if reason:
             self._end_before_it_began(reason)
 
@@ -278,29 +278,29 @@ class MissionFlight:
         self._system.say(WARNING, f"flight ended before it began: {reason}")
         self._end(PAUSED)
 
-    def _against_waiting(self, flight: _Flight) -> str:
+    def _reason_to_abandon(self, flight: _Flight) -> str:
         """Returns why the body no longer waits for a flight; empty while it does."""
         s = self._system.subject
         mode = s.picture.mode(s.body)
-        flight.holds = flight.holds or mode == Mode.POSHOLD
+        flight.hold_reached = flight.hold_reached or mode == Mode.POSHOLD
         if not s.armed:
             return "the vehicle is disarmed"
         if s.picture.members(s.body) != flight.members:
             return "the body is another one"
-        if self._system.taken != flight.taken:
+        if self._system.task_changes != flight.task_changes:
             return "paused, or something else was asked for"
         if mode == Mode.POSHOLD or (mode == Mode.AUTO and flight.arrivals_s):
             return ""
-        return f"the mode is {mode.name}" if flight.holds or s.picture.ticks > self._hold_by_tick else ""
+        return f"the mode is {mode.name}" if flight.hold_reached or s.picture.ticks > self._hold_by_tick else ""
 
     def _ask_for_plan(self) -> None:
         s = self._system.subject
-        if self._plan_at_tick is None or s.picture.ticks < self._plan_at_tick or self._flight is None or not self._flight.holds:
+        if self._plan_at_tick is None or s.picture.ticks < self._plan_at_tick or self._flight is None or not self._flight.hold_reached:
             return
         self._plan_at_tick = None
         at, ground = s.record.setpoint, self._parameters().ground
         self._serial += 1
-        self._flight.terms = self._terms(self._flight.legs)
+        self._flight.plan_inputs = self._plan_inputs(self._flight.legs)
         self.jobs.append(
             PlanJob(
                 s.body, self._serial, at.p_wb, at.q_wb, self._with_speeds(self._flight.legs), ground.mission_acceleration,
@@ -312,7 +312,7 @@ class MissionFlight:
         cruise = self._cruise
         return tuple(leg._replace(speed_m_s=cruise) if math.isnan(leg.speed_m_s) else leg for leg in legs)
 
-    def _terms(self, legs: Sequence[Leg]) -> tuple[Any, ...]:
+    def _plan_inputs(self, legs: Sequence[Leg]) -> tuple[Any, ...]:
         ground = self._parameters().ground
         places = (None if leg.p_wb is None else tuple(leg.p_wb) for leg in legs)
         rest = (leg._replace(p_wb=None) for leg in self._with_speeds(legs))
@@ -321,9 +321,9 @@ class MissionFlight:
     def _flies_already(self, legs: Sequence[Leg]) -> bool:
         """Whether exactly these legs are under way and none is reached: a client repeats its request if the answer was lost."""
         flight = self._flight
-        if flight is None or flight.replaced or flight.reached or flight.taken != self._system.taken:
+        if flight is None or flight.replaced or flight.reached or flight.task_changes != self._system.task_changes:
             return False
-        return flight.terms == self._terms(legs)
+        return flight.plan_inputs == self._plan_inputs(legs)
 
     def _advance(self, flight: _Flight, time_ns: int) -> None:
         assert flight.started_ns is not None
@@ -352,7 +352,8 @@ class MissionFlight:
         s = self._system.subject
         self._serial += 1  # makes a plan still in progress obsolete
         self._system.ask(Action.SET_MODE, Mode.POSHOLD)
-        self._flight = _Flight(tuple(legs), self._terms(legs), taken=self._system.taken, members=s.picture.members(s.body))
+        changes, members = self._system.task_changes, s.picture.members(s.body)
+        self._flight = _Flight(tuple(legs), self._plan_inputs(legs), task_changes=changes, members=members)
         self._plan_at_tick, self._hold_by_tick = s.picture.ticks + _SETTLE_TICKS, s.picture.ticks + _HOLD_TICKS
 
     def _end(self, state: int) -> None:
@@ -360,7 +361,7 @@ class MissionFlight:
         self.jobs.clear()
         if flight is not None and flight.of_mission and not flight.replaced:
             self._system.subject.progress.state = state
-            self._left = flight.legs[flight.reached :] or flight.legs[-1:]
+            self._remaining_legs = flight.legs[flight.reached :] or flight.legs[-1:]
 
     @property
     def _first(self) -> int:

@@ -22,7 +22,7 @@ _ASKED_ALIKE = 4
 answer it with float32 degrees, which resolve a place to a metre, or refuse it.
 """
 _FLIES = "it flies, and is not changed in part"
-_AT_ONCE = (2, 3)
+_IMMEDIATE_CURRENT = (2, 3)
 """Values of `current` in an item outside a mission: ArduPilot's way to go to a place or to an altitude at once."""
 
 
@@ -102,7 +102,7 @@ class MissionService:
         if count > MOST_ITEMS:
             self._acknowledge(arrival, _NO_SPACE, kind)
             return
-        if reason := self._against(arrival):
+        if reason := self._upload_refusal(arrival):
             self._deny(arrival, kind, reason)
             return
         if count == 0:
@@ -119,15 +119,15 @@ class MissionService:
         known = self._flight.items
         if kind != _MISSION or not 0 <= first <= last < len(known):
             self._acknowledge(arrival, _UNSUPPORTED if kind != _MISSION else _INVALID_SEQUENCE, kind)
-        elif reason := _FLIES if self._flight.flies else self._against(arrival):
+        elif reason := _FLIES if self._flight.flies else self._upload_refusal(arrival):
             self._deny(arrival, kind, reason)
         else:
             self._upload = _Upload(arrival, last + 1, kind, list(known[:first]), known[last + 1 :], in_part=True)
             self._ask(self._upload, arrival.time_ns)
 
-    def _against(self, arrival: Arrival) -> str:
+    def _upload_refusal(self, arrival: Arrival) -> str:
         """Returns why this client may not upload a mission now; empty if it may."""
-        if self._system.is_one_of_several(arrival):
+        if self._system.is_ambiguous_broadcast(arrival):
             return "it is for all, and there are several bodies"  # they would fly to the same place
         return "another station is sending one" if self._upload is not None and not _same(self._upload.arrival, arrival) else ""
 
@@ -142,8 +142,8 @@ class MissionService:
 
     def _item(self, arrival: Arrival) -> None:
         upload = self._upload
-        if upload is None or not _brings(arrival, upload):
-            self._item_of_none(arrival)
+        if upload is None or not _belongs_to(arrival, upload):
+            self._item_outside_upload(arrival)
             return
         sequence = arrival.message["seq"]
         if sequence != len(upload.items):
@@ -151,7 +151,7 @@ class MissionService:
         item, fault = item_of(arrival.message)
         why = f"command {item.command}, frame {item.frame}"
         if not fault:
-            fault, why = self._flight.against(item)
+            fault, why = self._flight.check_fence(item)
         if fault:
             self._system.say(WARNING, f"mission refused: item {sequence}, {why}")
             self._end(arrival, fault, upload.kind)
@@ -168,15 +168,15 @@ class MissionService:
         (self._flight.amend if upload.in_part else self._flight.replace)((*upload.items, *upload.rest))
         self._end(arrival, _ACCEPTED, upload.kind)
 
-    def _item_of_none(self, arrival: Arrival) -> None:
+    def _item_outside_upload(self, arrival: Arrival) -> None:
         """Answers an item outside the upload in progress: a repeat of the item that ended the last one, or a place to go to at once.
 
         An item is repeated when the answer to it was lost.
         """
         kind = arrival.message["mission_type"]
-        if self._ended is not None and _is_again(arrival, self._ended.item):
+        if self._ended is not None and _is_repeat(arrival, self._ended.item):
             self._acknowledge(arrival, self._ended.result, kind)
-        elif arrival.message["current"] in _AT_ONCE:
+        elif arrival.message["current"] in _IMMEDIATE_CURRENT:
             self._system.say(WARNING, "a place is gone to at once by DO_REPOSITION, as COMMAND_INT")
             self._acknowledge(arrival, _UNSUPPORTED, kind)
 
@@ -194,7 +194,7 @@ class MissionService:
     def _acknowledged(self, arrival: Arrival) -> None:
         """Takes MISSION_ACK: no effect after a download; cancels an upload, unless it concerns fences or rally points."""
         upload, m = self._upload, arrival.message
-        if upload is None or not _brings(arrival, upload) or m["type"] == _ACCEPTED:
+        if upload is None or not _belongs_to(arrival, upload) or m["type"] == _ACCEPTED:
             return
         if not (m["type"] == _UNSUPPORTED and upload.in_old_form):  # MAVSDK refuses the old form this way, and continues
             self._upload = None
@@ -243,11 +243,11 @@ def _sent_frame(item: Item, whole: bool) -> int:
     return pairs.get(item.frame, item.frame)
 
 
-def _is_again(item: Arrival, before: Arrival) -> bool:
+def _is_repeat(item: Arrival, before: Arrival) -> bool:
     return _same(item, before) and all(item.message[name] == before.message[name] for name in ("seq", "mission_type"))
 
 
-def _brings(arrival: Arrival, upload: _Upload) -> bool:
+def _belongs_to(arrival: Arrival, upload: _Upload) -> bool:
     """Whether a message belongs to the upload. Stations may share a system id, as all QGroundControls do; the channel tells them apart."""
     told = _same(upload.arrival, arrival) and arrival.channel == upload.arrival.channel
     return told and arrival.message["mission_type"] == upload.kind

@@ -17,14 +17,14 @@ from firmware_py.core.types import WARNING, Action
 from firmware_py.description.parameters import Parameters, registry
 from firmware_py.description.schema import DescriptionError, Limits
 from firmware_py.ground.files import write_atomically
-from firmware_py.ground.stored_parameters import differences_toml, laid_over
+from firmware_py.ground.stored_parameters import differences_toml, with_stored_values
 from firmware_py.ground.system import Arrival, Handler, System
 
 REAL32 = 9
 _INTEGERS = {1: "<B", 2: "<b", 3: "<H", 4: "<h", 5: "<I", 6: "<i"}
 """Integer types by MAV_PARAM_TYPE that fit into a float's four bytes, with their struct formats."""
 _SMALLEST_NORMAL = 1.1754944e-38
-_AT_ONCE = 5
+_VALUES_PER_TICK = 5
 """Values sent per tick when a client requests all: a radio's buffer is small."""
 
 
@@ -34,7 +34,7 @@ class ParameterStore:
     def __init__(self, parameters: Parameters, path: Path | None = None) -> None:
         """Overlays `parameters`, with which the process was started, with the values stored in `path`. Raises DescriptionError."""
         self._path, self._started = path, parameters
-        self.values = laid_over(parameters, path)
+        self.values = with_stored_values(parameters, path)
         self.names: dict[str, tuple[str, Limits]] = {
             limits.mavlink: (dotted, limits) for dotted, limits in registry() if limits.mavlink
         }
@@ -84,12 +84,12 @@ class ParameterService:
         for channel, first in list(self._to_send.items()):
             if channel in self._system.busy:
                 continue
-            for name in self._store.order[first : first + _AT_ONCE]:
+            for name in self._store.order[first : first + _VALUES_PER_TICK]:
                 self._system.send(channel, "PARAM_VALUE", self._value(name))
-            if first + _AT_ONCE >= len(self._store.order) or channel not in self._system.channels:
+            if first + _VALUES_PER_TICK >= len(self._store.order) or channel not in self._system.channels:
                 del self._to_send[channel]
             else:
-                self._to_send[channel] = first + _AT_ONCE
+                self._to_send[channel] = first + _VALUES_PER_TICK
 
     def _read(self, arrival: Arrival) -> None:
         index, order = arrival.message["param_index"], self._store.order

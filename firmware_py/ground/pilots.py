@@ -13,7 +13,7 @@ Sender = tuple[int, int]
 """System id, component id."""
 
 
-class Turn:
+class SenderArbiter:
     """Arbitrates messages of one kind: one sender has control at a time.
 
     Args of the constructor:
@@ -27,14 +27,14 @@ class Turn:
         self._refused: set[Sender] = set()
         self._heard_ns = 0
 
-    def is_over(self, time_ns: int) -> bool:
+    def is_free(self, time_ns: int) -> bool:
         """Whether no sender has control."""
         return self._sender is None or time_ns - self._heard_ns > self._timeout_s() * NS_PER_S
 
-    def is_of(self, arrival: Arrival) -> bool:
+    def claim(self, arrival: Arrival) -> bool:
         """Registers a message. Returns whether its sender has control, which it takes when no other sender has."""
         sender = sender_of(arrival)
-        if sender != self._sender and not self.is_over(arrival.time_ns):
+        if sender != self._sender and not self.is_free(arrival.time_ns):
             if sender not in self._refused:
                 self._say_who_has_it()
                 self._refused.add(sender)
@@ -61,20 +61,20 @@ class Pilots:
 
     def __init__(self, system: System, may_steer: Callable[[int, int], bool], timeout_s: Callable[[], float]) -> None:
         self._system, self._may_steer = system, may_steer
-        self._turn = Turn(system, "sticks", timeout_s)
+        self._arbiter = SenderArbiter(system, "sticks", timeout_s)
         self._pressed: dict[Sender, int] = {}
         self._never: set[Sender] = set()
         """Senders already told that their sticks are not accepted."""
 
     def are_silent(self, time_ns: int) -> bool:
         """Whether no sender has the sticks."""
-        return self._turn.is_over(time_ns)
+        return self._arbiter.is_free(time_ns)
 
-    def steers(self, arrival: Arrival) -> bool:
+    def claim_sticks(self, arrival: Arrival) -> bool:
         """Registers a message with sticks. Returns whether its sender has control of them."""
         sender = sender_of(arrival)
         if self._may_steer(*sender):
-            return self._turn.is_of(arrival)
+            return self._arbiter.claim(arrival)
         if sender not in self._never:
             self._never.add(sender)
             self._system.say(NOTICE, f"sticks of {sender[0]}/{sender[1]} are not taken: it is not the watched ground station")

@@ -148,12 +148,12 @@ class GroundStation:
                 if event.body in (None, services.system.body, services.system.subject.leader):
                     services.commands.hear(event)
                     services.flight.hear(event)
-        self._tell()
-        self._take_torn(outputs.time_ns)
+        self._send_event_texts()
+        self._flush_torn_frames(outputs.time_ns)
         for services in self.services.values():
             services.step(outputs.time_ns)
 
-    def _tell(self) -> None:
+    def _send_event_texts(self) -> None:
         """Sends events as texts of the body that they concern; the first present system reports those of no present body."""
         present: dict[int | None, System] = {system.body: system for system in self.present()}
         while present and self.picture.events:
@@ -161,7 +161,7 @@ class GroundStation:
             speaker = present.get(event.body, next(iter(present.values())))
             speaker.say(event.severity, event.text)
 
-    def spare(self, busy: Set[int]) -> None:
+    def set_busy(self, busy: Set[int]) -> None:
         """Treats these channels as busy until the next call."""
         self._busy.clear()
         self._busy.update(busy)
@@ -193,7 +193,7 @@ class GroundStation:
             self._take_packet(packet, channel, time_ns, trusted)
         return any(packet.message.name not in _NEVER_SIGNED for packet in packets)
 
-    def _take_torn(self, time_ns: int) -> None:
+    def _flush_torn_frames(self, time_ns: int) -> None:
         """Abandons incomplete frames of streams that have fallen silent: a stop may follow in the same bytes."""
         silent = [channel for channel, (heard_ns, _) in self._last_bytes.items() if time_ns - heard_ns > _TORN_NS]
         for channel in silent:

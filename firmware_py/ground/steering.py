@@ -17,7 +17,7 @@ from firmware_py.core.setpoint import leashed, leashed_turn
 from firmware_py.core.types import NOTICE, WARNING, Action, DockRequest, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.dialect import Message
-from firmware_py.ground.pilots import Pilots, Sender, Turn, sender_of
+from firmware_py.ground.pilots import Pilots, Sender, SenderArbiter, sender_of
 from firmware_py.ground.system import NS_PER_S, STOPPING, Arrival, Handler, System
 
 _FULL, _MIDDLE_UP = 1000.0, 500.0
@@ -105,7 +105,7 @@ class Steering:
         self._pilots = Pilots(system, may_steer, lambda: parameters().steering.stick_timeout_s)
         self._sticks = Sticks()
         self._overrides: dict[Sender, list[_Override]] = {}
-        self._turn = Turn(system, "set-points", lambda: parameters().ground.setpoint_fresh_s)
+        self._arbiter = SenderArbiter(system, "set-points", lambda: parameters().ground.setpoint_fresh_s)
         self._setpoint_ns: int | None = None
         self._setpoint: Setpoint | None = None
 
@@ -188,7 +188,7 @@ class Steering:
         if not self._system.body_is_known:
             self._system.refuse(arrival.time_ns)
             return False
-        steers = self._pilots.steers(arrival)
+        steers = self._pilots.claim_sticks(arrival)
         if steers:
             self._sticks = sticks
             self._system.ask(Action.STICKS, sticks)
@@ -280,7 +280,7 @@ class Steering:
 
     def _stream(self, setpoint: Setpoint, arrival: Arrival) -> None:
         """Requests `setpoint` if its sender has control of the set-points."""
-        if self._turn.is_of(arrival):
+        if self._arbiter.claim(arrival):
             self._setpoint, self._setpoint_ns = setpoint, arrival.time_ns
             self._system.ask(Action.SET_POINT, setpoint)
 

@@ -16,7 +16,7 @@ _FEW = 8
 """Most stored parameters that `stored_line` lists by name."""
 
 
-def laid_over(parameters: Parameters, path: Path | None) -> Parameters:
+def with_stored_values(parameters: Parameters, path: Path | None) -> Parameters:
     """Returns `parameters` overlaid with the values stored in `path`, if the file exists. Raises DescriptionError."""
     if path is None or not path.exists():
         return parameters

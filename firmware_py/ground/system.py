@@ -18,13 +18,13 @@ _SELDOM_NS = 5 * NS_PER_S
 """Least time between two refusals in text: refused messages may stream in."""
 NEVER_WAITS = ("HEARTBEAT", "STATUSTEXT")
 """Messages sent even to busy channels: without HEARTBEAT clients lose the vehicle, and STATUSTEXT is sent only once."""
-_AT_ONCE = ("HEARTBEAT", "MISSION_CURRENT")
+_SEND_ON_CHANGE = ("HEARTBEAT", "MISSION_CURRENT")
 """Messages sent as soon as they change. HEARTBEAT shows a pilot arming, modes and stops; MISSION_CURRENT tells a client that the mission
 it uploaded has arrived, and where it begins.
 """
 STOPPING = frozenset({Action.ESTOP, Action.DISARM})
 """Actions that reach a module whichever body it is part of."""
-STEERING = STOPPING | {Action.SET_MODE, Action.HOLD, Action.DOCK, Action.UNDOCK, Action.MOTOR_TEST}
+TASK_CHANGING_ACTIONS = STOPPING | {Action.SET_MODE, Action.HOLD, Action.DOCK, Action.UNDOCK, Action.MOTOR_TEST}
 """Actions that give the body another task."""
 
 
@@ -58,11 +58,11 @@ class System:
     """Present channels with their message rates."""
     requests: list[Request] = field(default_factory=list)
     """Requests for the next tick."""
-    taken: int = 0
-    """Number of STEERING actions requested so far: a change means that the body was given another task."""
+    task_changes: int = 0
+    """Number of TASK_CHANGING_ACTIONS requested so far: a change means that the body was given another task."""
     _text_number: int = 0
     _said: dict[str, Any] = field(default_factory=dict)
-    """Last values of each message of `_AT_ONCE`."""
+    """Last values of each message of `_SEND_ON_CHANGE`."""
     _refused_ns: int = -_SELDOM_NS
 
     @property
@@ -88,7 +88,7 @@ class System:
 
     def ask(self, action: Action, argument: Any = None) -> None:
         """Adds a request for the next tick; those that stop go to the body that contains this body's own module."""
-        self.taken += action in STEERING
+        self.task_changes += action in TASK_CHANGING_ACTIONS
         body = self.subject.leader if action in STOPPING else self.body
         self.requests.append(Request(action, body, argument))
 
@@ -101,7 +101,7 @@ class System:
         gone = f"docked, system {leader} leads it now" if leader != own else "no tick has told of its body"
         self.say(WARNING, f"system {own} is not steered: {why or gone}")
 
-    def is_one_of_several(self, arrival: Arrival) -> bool:
+    def is_ambiguous_broadcast(self, arrival: Arrival) -> bool:
         """Whether a message addresses all systems while there are several bodies, all of which it would steer to one place."""
         return arrival.message["target_system"] == 0 and len(self.subject.picture.records) > 1
 
@@ -128,9 +128,9 @@ class System:
     def stream(self, time_ns: int) -> None:
         """Sends the messages due on every channel; each is built once. A slow link gets fewer of every kind, but all heartbeats.
 
-        A message of `_AT_ONCE` is due at once when its values change.
+        A message of `_SEND_ON_CHANGE` is due at once when its values change.
         """
-        for name in _AT_ONCE:
+        for name in _SEND_ON_CHANGE:
             before, self._said[name] = self._said.get(name), STREAMS[name](self.subject)
             if self._said[name] != before:
                 for rates in self.channels.values():

@@ -41,10 +41,10 @@ def test_answers_find_their_way_while_a_log_is_fetched_over_a_radio(tmp_path: Pa
     world = World(config=GroundConfig(logs=str(tmp_path)))
     client = world.client()
     client.send("LOG_REQUEST_DATA", 1, 1, 0, 0, 0xFFFFFFFF)
-    world.station.spare({client.channel})
+    world.station.set_busy({client.channel})
     world.run(50)
     assert not client.all("LOG_DATA") and client.all("HEARTBEAT")
-    world.station.spare(set())
+    world.station.set_busy(set())
     world.run(2)
     assert len(client.all("LOG_DATA")) == 40
 

@@ -42,7 +42,7 @@ def test_no_module_is_commanded_before_it_has_said_how_it_is():
     robot, encoder = Robot(TWO_BUSES), OutputEncoder(TWO_BUSES, CODEC)
     robot.say("GYRO", (0.0, 0.0, 0.0, 0), number=1, bus=1)
     robot.say("MCU_STATUS", (0, 1, 0, 4), number=2, bus=1)
-    frames = encoder.frames(outputs(*[command(armed=False, relays=(0,) * 6)] * 3), robot.collector.unmet)
+    frames = encoder.frames(outputs(*[command(armed=False, relays=(0,) * 6)] * 3), robot.collector.without_status)
     commanded = [(bus, number) for bus, name, number in sent(frames) if name.startswith("THRUSTER")]
     assert commanded == [(1, 2)] * 2
     assert sum(name == "DOCK_CMD" for _, name, _ in sent(frames)) == 3

@@ -14,7 +14,7 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.description.toml_text import to_toml
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.parameters import ParameterStore
-from firmware_py.ground.stored_parameters import laid_over, stored_line
+from firmware_py.ground.stored_parameters import stored_line, with_stored_values
 
 SHIPPED = Parameters()
 RELEASE = Parameters(control=Control(position_bandwidth=2.5, attitude_bandwidth=4.5))
@@ -63,7 +63,7 @@ def test_whole_file_of_an_earlier_release_loads_and_shrinks_to_what_differs(path
 def test_store_that_is_wrong_is_refused_by_file_and_name(path: Path, text: str, words: str) -> None:
     path.write_text(text)
     with pytest.raises(DescriptionError, match=words) as error:
-        laid_over(SHIPPED, path)
+        with_stored_values(SHIPPED, path)
     assert "\n" not in str(error.value)
 
 
