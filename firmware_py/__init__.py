@@ -6,9 +6,9 @@ BLAS runs single-threaded: the matrices of a tick are small, and the same inputs
 import os
 from pathlib import Path
 
-from firmware_py.compiled_code import CACHE_FOLDER, forget_stale_code, passing_place
+from firmware_py.compiled_code import CACHE_FOLDER, forget_stale_code, temporary_cache_folder
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 forget_stale_code(Path(__file__).parents[1], "firmware_py")
-if PASSING_PLACE := passing_place(Path(__file__).parent, os.environ):
-    os.environ[CACHE_FOLDER] = PASSING_PLACE
+if TEMPORARY_CACHE := temporary_cache_folder(Path(__file__).parent, os.environ):
+    os.environ[CACHE_FOLDER] = TEMPORARY_CACHE

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-from firmware_py import PASSING_PLACE
+from firmware_py import TEMPORARY_CACHE
 from firmware_py.runtime import disk
 from firmware_py.runtime.interrupts import INTERRUPTED, ended_at_once
 
@@ -23,7 +23,7 @@ NO_ROOM = "modcube: compiled code cannot be kept: {}; make room on that disk, or
 
 def main() -> None:
     """Runs the command line. Imports that take a second or more are made here."""
-    if PASSING_PLACE:
+    if TEMPORARY_CACHE:
         print(COMPILED_IN_PASSING, file=sys.stderr, flush=True)
     try:
         with compiling_told(sys.stderr):

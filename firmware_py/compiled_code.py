@@ -25,7 +25,7 @@ def cached_sources(root: Path, packages: Iterable[str]) -> set[str]:
     return {str(path.relative_to(root)) for path in found}
 
 
-def taken_in(root: Path, names: Iterable[str]) -> dict[str, bytes]:
+def transitive_sources(root: Path, names: Iterable[str]) -> dict[str, bytes]:
     """Contents, by name, of the files `names` below `root` and of all from which they import modules or constants (in capitals)."""
     found = dict[str, bytes]()
     left = set(names)
@@ -55,7 +55,7 @@ def forget_stale_code(root: Path, package: str, *used: str) -> None:
     if not mine:
         return
     try:
-        sources = taken_in(root, cached_sources(root, (package, *used)))
+        sources = transitive_sources(root, cached_sources(root, (package, *used)))
         newest = max((root / name).stat().st_mtime for name in sources) if sources else 0.0
     except OSError:  # a source that cannot be read cannot be imported either
         return
@@ -67,7 +67,7 @@ def forget_stale_code(root: Path, package: str, *used: str) -> None:
             pass
 
 
-def passing_place(package: Path, environment: Mapping[str, str]) -> str:
+def temporary_cache_folder(package: Path, environment: Mapping[str, str]) -> str:
     """Creates a temporary folder for compiled code, removed at exit; "" where numba finds a lasting place, or none can be created.
 
     Numba itself tries the folder beside each source and the user's cache folder, and raises where neither can be written.

@@ -18,7 +18,7 @@ from firmware_py.core.types import Outputs
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.disk import writing_to
-from firmware_py.runtime.interrupts import held_back
+from firmware_py.runtime.interrupts import interrupts_deferred
 from firmware_py.runtime.realtime import quiet_garbage
 from firmware_py.runtime.recorder import Recorder
 from hil.dock_script import DockScript
@@ -157,7 +157,7 @@ def fly_scenario(
     with writing_to(out), ExitStack() as stack:
         bench = open_bench(stack, scenario, seed, parameters, bus, rate_hz)
         bench.listen()
-        check = stack.enter_context(held_back())
+        check = stack.enter_context(interrupts_deferred())
         if before_logs is not None:
             before_logs()
         recorder = Recorder(out, configuration_of(bench.firmware, scenario=scenario.name, seed=seed, rate_hz=rate_hz))

@@ -25,7 +25,7 @@ from firmware_py.core.types import Outputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.runtime.clock import MonotonicClock
-from firmware_py.runtime.interrupts import held_back, out_of_reach
+from firmware_py.runtime.interrupts import interrupts_deferred, signals_blocked
 from firmware_py.runtime.realtime import PLANT_PRIORITY, TICK_PRIORITY, quiet_garbage, read_libraries, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
 from hil.bench import fleet_of, script_of
@@ -113,7 +113,7 @@ def fly_in_real_time(
         plant, handshake = stack.enter_context(_plant(start_method, serve, scenario, seed, bus, rate_hz, out))
         firmware = compose(fleet, parameters)
         _wait_until_ready(plant, handshake)
-        check = stack.enter_context(held_back())
+        check = stack.enter_context(interrupts_deferred())
         if before_logs is not None:
             before_logs()
         recorder = _recorder(stack, out, firmware, scenario.name, seed, rate_hz)
@@ -188,7 +188,7 @@ def _plant(start_method: str, serve: Callable[..., None], *arguments: Any) -> It
     context: SpawnContext | ForkContext = fork if start_method == "fork" else spawn
     handshake = Handshake(context.Event(), context.Event(), context.Event())
     plant = context.Process(target=serve, args=(*arguments, handshake), name="plant", daemon=True)
-    with out_of_reach():
+    with signals_blocked():
         plant.start()
     try:
         yield plant, handshake

@@ -13,7 +13,7 @@ import zipfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from firmware_py.compiled_code import cached_sources, taken_in
+from firmware_py.compiled_code import cached_sources, transitive_sources
 
 FILE_TIME_S = 315532800
 """1980-01-01, the time of every file of a release: caches of compiled code identify their source by time and size."""
@@ -68,7 +68,7 @@ def carry_compiled(old: Path, new: Path) -> bool:
 def compiled_from(packages: Path, cached: set[str]) -> dict[str, bytes]:
     """Contents, by path, of the files `cached`, our others that use numba, and those that either imports modules or constants from."""
     files = [path for package in OWN_PACKAGES for path in (packages / package).rglob("*.py") if b"numba" in path.read_bytes()]
-    return taken_in(packages, cached | {str(path.relative_to(packages)) for path in files})
+    return transitive_sources(packages, cached | {str(path.relative_to(packages)) for path in files})
 
 
 def file_digest(path: Path) -> str:

@@ -19,9 +19,9 @@ STATES = ("boot", "disarmed", "armed", "time-out of commands", "e-stop", "fault"
 FIT_STATES = (1, 2, 3)
 """Indices into STATES. A module in any other state turns no thruster when it is armed."""
 ERRORS = ("bad CRC", "bad counter", "bad length", "command time-out", "sensor fault", "relay fault")
-TOO_MANY = 1.5
+MAX_COMMANDS_PER_SYNC = 1.5
 """Commands to a module per SYNC above which more than one controller must be sending, however many of either were missed."""
-TIME_OUT = 1 << 3
+COMMAND_TIMEOUT_BIT = 1 << 3
 """Error bit of MCU_STATUS. Not a fault here, because no one commands the module during the check."""
 WRONG: Mapping[str, Mapping[int, str]] = {
     "Leak": {1: "water in its cabin"},
@@ -132,7 +132,7 @@ def judge(title: str, seen: Seen, numbers: list[int], rate_hz: int, codec: Codec
 
 def judge_commands(title: str, seen: Seen) -> Iterator[Finding]:
     """Finds modules commanded by a second controller. The one controller of a bus commands each module once after each SYNC."""
-    commanded = sorted(number for number, count in seen.commands.items() if count > TOO_MANY * seen.sync)
+    commanded = sorted(number for number, count in seen.commands.items() if count > MAX_COMMANDS_PER_SYNC * seen.sync)
     if not commanded:
         return
     numbers = ", ".join(str(number) for number in commanded)
@@ -146,7 +146,7 @@ def judge_module(title: str, number: int, seen: Seen, codec: Codec) -> Finding:
         return Finding(title, FAILED, f"module {number} is silent", "is it powered, its number set? candump shows ids")
     version, errors, state = seen.status[number]
     text = f"module {number}: version {version}, {STATES[state] if state < len(STATES) else state}"
-    words = [word for bit, word in enumerate(ERRORS) if errors & ~TIME_OUT & 1 << bit] + [*seen.wrong.get(number, ())]
+    words = [word for bit, word in enumerate(ERRORS) if errors & ~COMMAND_TIMEOUT_BIT & 1 << bit] + [*seen.wrong.get(number, ())]
     missing = sorted(expected_of(codec) - seen.messages[number])
     if words:
         return Finding(title, WARNING, f"{text}; reports {', '.join(words)}", "see can_dbc/README.md")

@@ -26,7 +26,7 @@ NOTE = "estop.txt"
 STANDS, CLEAR = b"stands\n", b"clear \n"
 CLOSE_S = 5.0
 """How long the end of a run waits for a disk."""
-AGAIN_S = 1.0
+RETRY_S = 1.0
 """Delay before a failed write of the note is retried."""
 
 
@@ -59,7 +59,7 @@ def clear(folder: Path) -> bool:
     """
     if not (folder / NOTE).exists():
         raise DescriptionError(f"{folder} holds no {NOTE}: no vehicle has logged there; give the folder of modcube run --out")
-    handle = hold(folder)
+    handle = lock_folder(folder)
     if handle is None:
         raise DescriptionError(f"a vehicle that runs logs into {folder}: end it first, or send it CLEAR_ESTOP")
     try:
@@ -70,7 +70,7 @@ def clear(folder: Path) -> bool:
     return stood
 
 
-def hold(folder: Path) -> int | None:
+def lock_folder(folder: Path) -> int | None:
     """Locks `folder` exclusively; returns a handle to close for release. None where another process holds the lock. Raises OSError."""
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -92,7 +92,7 @@ class EstopNote:
         self._folder = folder
         self._handle: int | None = None
         with suppress(OSError):  # a folder that cannot be opened is reported by the first failed write
-            self._handle = hold(folder)
+            self._handle = lock_folder(folder)
             if self._handle is None:
                 raise DescriptionError(f"another vehicle that runs logs into {folder}: end it first, or give this one another --out")
         self._queue: SimpleQueue[bool | None] = SimpleQueue()
@@ -124,7 +124,7 @@ class EstopNote:
         while not ended:
             fresh = False
             with suppress(Empty):
-                told = self._queue.get(timeout=None if waiting is None else AGAIN_S)
+                told = self._queue.get(timeout=None if waiting is None else RETRY_S)
                 fresh, ended = told is not None, told is None
                 waiting = waiting if ended else told
             try:
@@ -136,7 +136,7 @@ class EstopNote:
                     self._failed.put(error)
             if self._handle is None:  # the folder did not exist before
                 with suppress(OSError):
-                    self._handle = hold(self._folder)
+                    self._handle = lock_folder(self._folder)
 
 
 def noting_estop(note: EstopNote, stands: bool, recorder: Recorder | None = None) -> Observer:

@@ -42,7 +42,7 @@ class Firmware:
         self.collector.sync_sent(tick, time_ns)
         return self.encoder.sync(tick)
 
-    def forget_heard(self) -> None:
+    def discard_received(self) -> None:
         """Discards what was collected, so that the first tick takes only frames after its SYNC, as the log records it."""
         self.collector = InputCollector(self.fleet, self.codec)
 

@@ -41,9 +41,9 @@ from firmware_py.runtime.rate_keeper import RateKeeper
 from firmware_py.runtime.realtime import die_with, use_ordinary_priority, use_priority
 from firmware_py.runtime.teller import Teller, write_line
 
-_AFTER = 0.1
+_WAKE_MARGIN = 0.1
 """Margin for ticks of different length, as a share of a period, before the thread would wake up too early."""
-_LONGEST = 10.0
+_MAX_SLEEP_PERIODS = 10.0
 """Longest sleep of the thread while the loop stands still, in periods."""
 _SWITCH_S = 50e-6
 """Longest time that a waking tick waits for the interpreter. Python's default of 5 ms would make it late."""
@@ -55,7 +55,7 @@ _SAVE_EVERY_NS = 1_000_000_000
 """Interval between saves of the signing time stamp; the saved stamp is ahead by as much. A new key is saved at once."""
 
 
-_NOTHING = PlanJob(0, 0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (), 0.1, 1.0)
+_WARM_UP_JOB = PlanJob(0, 0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (), 0.1, 1.0)
 """A job without legs, which makes the planning process load its code."""
 
 Awaited = Array[Any]
@@ -241,9 +241,11 @@ class GroundSide:
             self.error = self.error or error
 
     def _rest_s(self) -> float:
-        """Sleep until shortly after the next tick, s; when the tick is overdue, half the time already waited, up to _LONGEST periods."""
+        """Sleep until shortly after the next tick, s; when the tick is overdue, half the time already waited, up to
+        _MAX_SLEEP_PERIODS.
+        """
         since = (self._clock.now_ns() - self._handed_over_ns) / self._period_ns
-        return max(1.0 + _AFTER - since, min(since / 2, _LONGEST)) * self._period_ns * 1e-9
+        return max(1.0 + _WAKE_MARGIN - since, min(since / 2, _MAX_SLEEP_PERIODS)) * self._period_ns * 1e-9
 
     def _plan(self) -> None:
         """Submit new planning jobs, each replacing an unstarted one of the same body; collect finished plans."""
@@ -264,7 +266,7 @@ class GroundSide:
         """Starts the planning process, from the thread with which it dies even when busy (`die_with`); it takes seconds to be ready."""
         if self._executor is None:
             self._executor = _planner(self._awaited)
-            self._executor.submit(_plan_mission, _NOTHING, None)
+            self._executor.submit(_plan_mission, _WARM_UP_JOB, None)
 
     def _begin(self, job: PlanJob, body: Body | None) -> Future[Plan]:
         """Submits a job to the planning process, or to a new one if that was killed, as the system does when memory is short."""

@@ -49,7 +49,7 @@ class RealTimeLoop:
         self._received.clear()
         if collector.faults["foreign_sync"]:
             raise PortError(OTHER_SYNC)
-        self.firmware.forget_heard()
+        self.firmware.discard_received()
 
     def run(self, stop: Callable[[int, Outputs], bool], first_tick: int = 1) -> None:
         """Ticks until `stop` returns true for a tick's number and outputs."""

@@ -53,11 +53,11 @@ ARM_EVERY_S = 1.0
 """Interval between attempts of the Operator to arm, once the pose is known."""
 FORGETFUL = "warning: --hold without --out: an e-stop in this run will not be known at the next start"
 UNTAGGED = "warning: module {} carries no [[tag]]: no camera places it, so --hold never arms it; a pilot has attitude and depth alone"
-MISUSED = (FileExistsError, NotADirectoryError, PermissionError)
+UNUSABLE_FOLDER_ERRORS = (FileExistsError, NotADirectoryError, PermissionError)
 """Errors of a log folder that is not a folder or not writable for us; these refuse the start. After other disk errors it flies unlogged."""
-STOPPED_BY = frozenset({Action.DISARM, Action.ESTOP})
+STOP_ACTIONS = frozenset({Action.DISARM, Action.ESTOP})
 """Requests of a person after which only a person arms any body."""
-TAKEN_BY = frozenset({Action.SET_MODE, Action.ARM, Action.MOTOR_TEST})
+TAKEOVER_ACTIONS = frozenset({Action.SET_MODE, Action.ARM, Action.MOTOR_TEST})
 """Requests of a person after which only a person arms the body concerned."""
 REARM_S = RECENT_NS / 1e9
 """How long REARM keeps trying. After that the previous flight no longer tells where the vehicle is, as with a log of that age."""
@@ -160,7 +160,7 @@ def run_vehicle(
         note = _open_note(stack, out) if out is not None else None  # before the log: of two processes started at once, one gets the folder
         notes = {"boot": boot, "apart": sorted(before.apart(firmware))}
         recorder = _open_recorder(stack, configuration_of(firmware, rate_hz=fleet.rate_hz, **notes), firmware, out, live, teller.say)
-        observers = list(_keeping(firmware, recorder, note, live, before.stopped))
+        observers = list(_recording_observers(firmware, recorder, note, live, before.stopped))
         told: list[Observer] = [telling(teller.say)]  # called after all other observers, which may add events
         requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
         side: GroundSide | None = None
@@ -176,7 +176,7 @@ def run_vehicle(
             teller.say(f"warning: {line}")
         loop = open_loop(stack, firmware, requests)
         buses = watching_buses(loop.ports, fleet.rate_hz)
-        loop.observers = [*observers, *_watching(loop, fleet.rate_hz, recorder, side, notifier), buses, *told]
+        loop.observers = [*observers, *_timing_observers(loop, fleet.rate_hz, recorder, side, notifier), buses, *told]
         use_priority(TICK_PRIORITY)
         move_to_own_processor()
         loop.listen()
@@ -200,7 +200,7 @@ def _open_note(stack: ExitStack, out: Path) -> EstopNote:
     return note
 
 
-def _keeping(
+def _recording_observers(
     firmware: Firmware, recorder: Recorder | None, note: EstopNote | None, live: LiveView | None, stopped: bool
 ) -> Iterator[Observer]:
     """Observers for the log, the e-stop note (`stopped`: an e-stop stands from before) and the live view."""
@@ -235,10 +235,10 @@ def _open_recorder(
 
 
 def _log_folder(out: Path, say: Callable[[str], None]) -> Path | None:
-    """A folder for a new log; None where a disk error prevents it. Raises one of MISUSED where `out` is no usable folder."""
+    """A folder for a new log; None where a disk error prevents it. Raises one of UNUSABLE_FOLDER_ERRORS where `out` is no usable folder."""
     try:
         return make_log_folder(out)
-    except MISUSED:
+    except UNUSABLE_FOLDER_ERRORS:
         raise
     except OSError as error:
         say(f"warning: no log: {error.filename or out}: {error.strerror}")
@@ -257,7 +257,7 @@ def _forget_failed_start(recorder: Recorder, folder: Path, out: Path) -> None:
             folder.rmdir()
 
 
-def _watching(
+def _timing_observers(
     loop: RealTimeLoop, rate_hz: int, recorder: Recorder | None, side: GroundSide | None, notifier: Notifier | None
 ) -> Iterator[Observer]:
     """Observers that report tick timing to the log, ground stations and the service manager, and port fault counters to the log."""
@@ -282,10 +282,10 @@ def with_ground(
 
     def requests(time_ns: int, last: Outputs | None) -> list[Request]:
         operator.stopping = operator.stopping or side.reboot_asked
-        asked = [request for request in side.requests() if request.action in STOPPED_BY or not operator.stopping]
-        if any(request.action in STOPPED_BY for request in asked):
+        asked = [request for request in side.requests() if request.action in STOP_ACTIONS or not operator.stopping]
+        if any(request.action in STOP_ACTIONS for request in asked):
             operator.to_arm.clear()
-        taken = {request.body for request in asked if request.action in TAKEN_BY}
+        taken = {request.body for request in asked if request.action in TAKEOVER_ACTIONS}
         operator.to_arm.difference_update(taken, *(body.modules for body in bodies() if body.index in taken))
         return [*operator.requests(time_ns, last), *asked]
 

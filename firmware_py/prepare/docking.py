@@ -14,7 +14,7 @@ from firmware_py.core.types import DockRequest
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS, Vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
-from firmware_py.prepare.joints import hanging_with
+from firmware_py.prepare.joints import connected_to
 from firmware_py.prepare.lattice import MATRICES, QUATERNIONS, nearest
 
 
@@ -82,11 +82,11 @@ def plan_undock(
     if wanted not in pairs:
         raise DescriptionError(f"modules {near} and {far} are not docked to each other")
     opened = [wanted, *(modules_of(joint) for joint in lost)]
-    piece = hanging_with(far, [pair for pair in pairs if pair not in opened])
+    piece = connected_to(far, [pair for pair in pairs if pair not in opened])
     if near in piece and not lost:
         piece = {far}
     stays = [m for m in whole.modules if m not in piece]
-    if near in piece or hanging_with(near, [pair for pair in pairs if not pair & piece]) != set(stays):
+    if near in piece or connected_to(near, [pair for pair in pairs if not pair & piece]) != set(stays):
         raise DescriptionError(f"modules {near} and {far} are also held together by other modules: undock those first")
     opens = [joint if joint.module in piece else turned(joint) for joint in joints if len(modules_of(joint) & piece) == 1]
     opens.sort(key=lambda joint: modules_of(joint) != wanted)

@@ -54,7 +54,7 @@ def check_joints(placements: Sequence[Placement], modules: Sequence[object], pit
             j = at.get(_neighbour(placement.cell, axis))
             if j is not None and _joined(placements, modules, i, j, axis):
                 joints.append(frozenset((i, j)))
-    reached = hanging_with(0, joints)
+    reached = connected_to(0, joints)
     if lost := [str(modules[i]) for i in range(len(placements)) if i not in reached]:
         raise DescriptionError(f"no docked face joins module {', '.join(lost)} to module {modules[0]}")
 
@@ -79,7 +79,7 @@ def _joined(placements: Sequence[Placement], modules: Sequence[object], i: int, 
     return set(kinds) == {"P", "D"}
 
 
-def hanging_with(start: int, joints: Sequence[frozenset[int]]) -> set[int]:
+def connected_to(start: int, joints: Sequence[frozenset[int]]) -> set[int]:
     """Modules connected to `start` through these joints, each a pair of modules; `start` included."""
     reached, before = {start}, set[int]()
     while reached != before:

@@ -15,12 +15,12 @@ from firmware_py.core.body import RANK_TOLERANCE, Body
 from firmware_py.core.drag_lookup import drag_wrench
 from firmware_py.core.rigid_body import coriolis_wrench, restoring_moment
 
-_FULL = 1e-6
+_SATURATION_TOLERANCE = 1e-6
 """Tolerance, as a share of a thruster's limit, within which the thruster counts as saturated."""
 
 _OUTSIDE = 1e-6
 """Share of a wrench that may lie outside the span through rounding."""
-_NOTHING = 1e-9
+_NEGLIGIBLE_WRENCH = 1e-9
 """Size of a wrench that counts as zero, N and N m."""
 
 _LEAN_STEP = 1e-4
@@ -108,7 +108,7 @@ def _change_by_lean(body: Body, motion: np.ndarray, axis: np.ndarray) -> np.ndar
 
 def _matters(part: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """(k,) whether a part (k, 6) of the wrenches (k, 6) exceeds rounding."""
-    return np.asarray(np.linalg.norm(part, axis=1) > _OUTSIDE * np.linalg.norm(wanted, axis=1) + _NOTHING)
+    return np.asarray(np.linalg.norm(part, axis=1) > _OUTSIDE * np.linalg.norm(wanted, axis=1) + _NEGLIGIBLE_WRENCH)
 
 
 def sag(wanted: np.ndarray, run: int) -> np.ndarray:
@@ -171,7 +171,7 @@ def _division(body: Body, share: float, forces: np.ndarray) -> np.ndarray:
     """
     thrusters = body.thrusters
     limits = np.where(forces > 0.0, thrusters.f_max, thrusters.f_min)
-    full = np.abs(forces - share * limits) <= _FULL * np.abs(limits)
+    full = np.abs(forces - share * limits) <= _SATURATION_TOLERANCE * np.abs(limits)
     basis = np.column_stack([np.eye(len(forces))[:, ~full], np.where(full, limits, 0.0)])
     return np.asarray(basis @ np.linalg.pinv(thrusters.matrix @ basis))
 

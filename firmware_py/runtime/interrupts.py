@@ -72,7 +72,7 @@ def interrupted_once() -> Iterator[None]:
 
 
 @contextmanager
-def held_back() -> Iterator[Callable[[], None]]:
+def interrupts_deferred() -> Iterator[Callable[[], None]]:
     """Defers Ctrl-C inside until the next call of the yielded function, or the end of the block, so that nothing is left half written.
 
     Defers SIGTERM too inside `interrupted_once`; elsewhere SIGTERM kills the process as usual.
@@ -93,7 +93,7 @@ def held_back() -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def out_of_reach() -> Iterator[None]:
+def signals_blocked() -> Iterator[None]:
     """Blocks Ctrl-C and SIGTERM: a child process started inside never receives them; this process receives them afterwards."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDINGS)
     try:

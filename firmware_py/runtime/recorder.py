@@ -43,7 +43,7 @@ from firmware_py.runtime.tick_messages import (
 CAN_LOG = "can.log"
 SIGNAL_LOG = "signals.mcap"
 CONFIGURATION = "configuration.json"
-TOGETHER = 10
+BATCH_TICKS = 10
 """Number of ticks that are encoded in one batch when not in real time, so that the encoding code stays in the processor's cache. In real
 time each tick encodes its own lines and messages."""
 LIVE_ONLY = ("/scene", "/tf")
@@ -93,7 +93,7 @@ class Recorder:
         kind = QueuedFile if queued else GuardedFile
         self._can = kind(folder / CAN_LOG if folder is not None else Path(os.devnull))
         self._mcap = kind(folder / SIGNAL_LOG if folder is not None else Path(os.devnull))
-        self._together = 1 if queued or context is not None else TOGETHER
+        self._batch_ticks = 1 if queued or context is not None else BATCH_TICKS
         self._frames: list[tuple[int, int, str, Collection[tuple[int, bytes]]]] = []
         """Arguments of `candump_lines` for frames whose lines are not made yet."""
         self._ticks: list[tuple[int, Inputs, Outputs]] = []
@@ -158,7 +158,7 @@ class Recorder:
         self._ticks.append((self._received, inputs, outputs))
         self._received = 0
         self.ticks += 1
-        if self.ticks % self._together == 0:
+        if self.ticks % self._batch_ticks == 0:
             self._make()
 
     def _make(self) -> None:

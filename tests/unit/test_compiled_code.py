@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.compiled_code import CACHE_FOLDER, caches, forget_stale_code, passing_place, taken_in
+from firmware_py.compiled_code import CACHE_FOLDER, caches, forget_stale_code, temporary_cache_folder, transitive_sources
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,7 +45,7 @@ def test_compiled_code_older_than_a_constant_that_it_holds_is_forgotten(tmp_path
 
 
 def test_the_constants_of_the_wire_are_among_what_is_compiled() -> None:
-    sources = taken_in(ROOT, ["firmware_py/bus/codec/receiver.py"])
+    sources = transitive_sources(ROOT, ["firmware_py/bus/codec/receiver.py"])
     assert {"firmware_py/bus/codec/crc.py", "firmware_py/bus/codec/message.py"} < sources.keys()
 
 
@@ -67,12 +67,12 @@ def test_folder_that_cannot_be_read_does_not_stop_the_import(tmp_path: Path, mon
 def test_compiled_code_that_can_be_kept_nowhere_goes_to_a_folder_for_this_run(tmp_path: Path) -> None:
     nowhere = written(tmp_path / "file", 100) / "folder"
     open_folder = tmp_path / "home"
-    place = Path(passing_place(nowhere, {"XDG_CACHE_HOME": str(nowhere)}))
+    place = Path(temporary_cache_folder(nowhere, {"XDG_CACHE_HOME": str(nowhere)}))
     assert place.is_dir() and list(place.iterdir()) == []
     place.rmdir()
-    assert passing_place(nowhere, {"XDG_CACHE_HOME": str(open_folder)}) == ""
-    assert passing_place(tmp_path / "package", {"XDG_CACHE_HOME": str(nowhere)}) == ""
-    assert passing_place(nowhere, {"XDG_CACHE_HOME": str(nowhere), CACHE_FOLDER: str(open_folder)}) == ""
+    assert temporary_cache_folder(nowhere, {"XDG_CACHE_HOME": str(open_folder)}) == ""
+    assert temporary_cache_folder(tmp_path / "package", {"XDG_CACHE_HOME": str(nowhere)}) == ""
+    assert temporary_cache_folder(nowhere, {"XDG_CACHE_HOME": str(nowhere), CACHE_FOLDER: str(open_folder)}) == ""
 
 
 def test_home_of_somebody_else_is_no_place_for_compiled_code_and_does_not_stop_the_import(
@@ -90,7 +90,7 @@ def test_home_of_somebody_else_is_no_place_for_compiled_code_and_does_not_stop_t
 
     monkeypatch.setattr(os, "stat", refused)
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path) != home and access(path, mode))
-    assert passing_place(tmp_path / "package", {"XDG_CACHE_HOME": str(home / ".cache")}) == ""
-    place = Path(passing_place(home / "package", {"XDG_CACHE_HOME": str(home / ".cache")}))
+    assert temporary_cache_folder(tmp_path / "package", {"XDG_CACHE_HOME": str(home / ".cache")}) == ""
+    place = Path(temporary_cache_folder(home / "package", {"XDG_CACHE_HOME": str(home / ".cache")}))
     assert place.is_dir()
     place.rmdir()

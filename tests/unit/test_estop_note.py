@@ -102,7 +102,7 @@ def test_note_that_cannot_be_made_is_said_once_and_the_flight_goes_on(tmp_path: 
 
 
 def test_stop_that_a_full_disk_did_not_take_is_noted_as_soon_as_there_is_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estop_note, "AGAIN_S", 0.01)
+    monkeypatch.setattr(estop_note, "RETRY_S", 0.01)
     tried, room, made = threading.Event(), threading.Event(), threading.Event()
     make = estop_note.write_atomically
 
@@ -189,14 +189,14 @@ def test_note_is_taken_where_folders_have_no_locks(tmp_path: Path, monkeypatch: 
 @pytest.mark.parametrize("is_there", [True, False])
 def test_folder_is_one_vehicle_s_while_that_runs(tmp_path: Path, is_there: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nobody else can clear that vehicle's e-stop, also where the vehicle itself had to make the folder."""
-    folder, held, hold = tmp_path / "log", threading.Event(), estop_note.hold
+    folder, held, hold = tmp_path / "log", threading.Event(), estop_note.lock_folder
 
     def hold_and_tell(path: Path) -> int | None:
         handle = hold(path)
         held.set()
         return handle
 
-    monkeypatch.setattr(estop_note, "hold", hold_and_tell)
+    monkeypatch.setattr(estop_note, "lock_folder", hold_and_tell)
     if is_there:
         write_note(folder, True)
     first = EstopNote(folder)

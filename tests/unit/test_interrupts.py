@@ -7,7 +7,7 @@ from contextlib import suppress
 
 import pytest
 
-from firmware_py.runtime.interrupts import held_back, interrupted_once, out_of_reach
+from firmware_py.runtime.interrupts import interrupted_once, interrupts_deferred, signals_blocked
 
 
 @pytest.fixture(autouse=True)
@@ -40,7 +40,7 @@ def test_termination_from_elsewhere_is_a_press_that_waits_as_any(background: boo
     if background:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell starts background processes
     done = []
-    with pytest.raises(KeyboardInterrupt), interrupted_once(), held_back() as check:
+    with pytest.raises(KeyboardInterrupt), interrupted_once(), interrupts_deferred() as check:
         press(signal.SIGTERM)
         done.append("the tick")
         check()
@@ -50,7 +50,7 @@ def test_termination_from_elsewhere_is_a_press_that_waits_as_any(background: boo
 
 
 def test_termination_stays_as_it_was_where_nobody_sent_it() -> None:
-    with interrupted_once(), held_back():
+    with interrupted_once(), interrupts_deferred():
         pass
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
 
@@ -81,7 +81,7 @@ def test_errors_that_nobody_pressed_stay_what_they_are() -> None:
 
 def test_press_waits_until_it_is_asked_for() -> None:
     done = []
-    with pytest.raises(KeyboardInterrupt), held_back() as check:
+    with pytest.raises(KeyboardInterrupt), interrupts_deferred() as check:
         check()
         press()
         press()
@@ -95,7 +95,7 @@ def test_press_waits_until_it_is_asked_for() -> None:
 def test_press_that_nobody_asked_for_comes_about_at_the_end() -> None:
     done = []
     with pytest.raises(KeyboardInterrupt):
-        with held_back():
+        with interrupts_deferred():
             press()
             done.append("all of it")
         done.append("more")
@@ -105,7 +105,7 @@ def test_press_that_nobody_asked_for_comes_about_at_the_end() -> None:
 def test_press_that_waited_counts_as_the_first() -> None:
     with pytest.raises(KeyboardInterrupt), interrupted_once():
         try:
-            with held_back() as check:
+            with interrupts_deferred() as check:
                 press()
                 check()
         finally:
@@ -117,7 +117,7 @@ def test_other_threads_and_ignored_interrupts_are_left_alone() -> None:
 
     def elsewhere() -> None:
         try:
-            with interrupted_once(), held_back() as check:
+            with interrupted_once(), interrupts_deferred() as check:
                 check()
         except BaseException as error:
             failed.append(error)
@@ -126,7 +126,7 @@ def test_other_threads_and_ignored_interrupts_are_left_alone() -> None:
     thread.start()
     thread.join()
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # as a shell starts background processes
-    with interrupted_once(), held_back() as check:
+    with interrupted_once(), interrupts_deferred() as check:
         press()
         check()
     assert failed == [] and signal.getsignal(signal.SIGINT) is signal.SIG_IGN
@@ -136,7 +136,7 @@ def test_other_threads_and_ignored_interrupts_are_left_alone() -> None:
 def test_process_that_is_begun_out_of_reach_is_spared_and_this_one_hears_of_it_later(number: signal.Signals) -> None:
     done = []
     with pytest.raises(KeyboardInterrupt), interrupted_once():
-        with out_of_reach():
+        with signals_blocked():
             press(number)
             done.append("begun")
         done.append("more")
