@@ -22,7 +22,7 @@ from hil.plant.vectors import F2, F3, F8, I8, compiled
 from hil.plant.water import WATER
 from hil.plant.world import Arrays, World
 
-FEW = 2
+MAX_SEQUENTIAL_WORLDS = 2
 """Largest number of worlds that run faster one by one than in eight mostly idle lanes."""
 SEEN = 16
 """Columns of a row: hull centre and attitude, world, 0:7; velocity, world, 7:10; rate and specific force, module frame, 10:16."""
@@ -48,17 +48,17 @@ def fly(worlds: Sequence[World], commands: np.ndarray, threads: int = 0) -> np.n
     _check_commands(given, count, len(worlds[0].vehicles[0].thruster))
     if threads < 0:
         raise DescriptionError(f"batch: {threads} threads; it needs 0, one a core, or more")
-    parts = [world.lend(given.shape[-2]) for world in worlds]
+    parts = [world.lend_arrays(given.shape[-2]) for world in worlds]
     given = np.array(np.broadcast_to(given, (count, *given.shape[-2:])), order="C")
     out = np.empty((count, given.shape[1], SEEN))
 
-    def some(first: int) -> None:
-        some = slice(first, min(first + LANES, count))
-        _fly_some(parts[some], given[some], out[some])
+    def run_lanes(first: int) -> None:
+        lanes = slice(first, min(first + LANES, count))
+        _fly_some(parts[lanes], given[lanes], out[lanes])
 
     wanted = min(threads or os.cpu_count() or 1, -(-count // LANES))
     with ThreadPoolExecutor(wanted) as pool:
-        list((pool.map if wanted > 1 else map)(some, range(0, count, LANES)))
+        list((pool.map if wanted > 1 else map)(run_lanes, range(0, count, LANES)))
     return out
 
 
@@ -68,7 +68,7 @@ def _check_worlds(worlds: Sequence[World]) -> None:
         raise DescriptionError("batch: no worlds; it needs one at least")
     if len({id(world) for world in worlds}) < len(worlds):
         raise DescriptionError("batch: the same world is given twice; each needs to be one of its own")
-    if len({world.terms() for world in worlds}) > 1:
+    if len({world.batch_key() for world in worlds}) > 1:
         raise DescriptionError("batch: worlds differ in tank, water or tick; all need the same")
     counts = {len(world.vehicles[0].thruster) for world in worlds}
     if len(counts) > 1 or max(counts) > CHANNELS:
@@ -85,7 +85,7 @@ def _check_commands(given: np.ndarray, worlds: int, thrusters: int) -> None:
 
 def _fly_some(parts: Sequence[Arrays], commands: np.ndarray, out: np.ndarray) -> None:
     """Runs at most eight worlds, in lanes or one by one."""
-    if len(parts) > FEW:
+    if len(parts) > MAX_SEQUENTIAL_WORLDS:
         return _fly_together(parts, commands, out)
     for part, given, seen in zip(parts, commands, out, strict=True):
         _fly_alone(*part, given, seen)

@@ -32,19 +32,19 @@ from hil.checks import Result
 from hil.flight import LOGS, fly_and_judge
 from hil.metrics import OUTCOMES
 from hil.plant.world_parameters import world_parameters
-from hil.replaceable import check_replaceable, is_json_with, made
+from hil.replaceable import check_replaceable, created_folder, is_json_with
 from hil.scenario import Scenario
 from hil.trial_file import OWNER, TrialFile
-from hil.workers import Pool, deaths
+from hil.workers import Pool, worker_death_exceptions
 
 SUMMARY_FILE, TABLE_FILE, TRIALS_FILE = "campaign.json", "trials.csv", "trials.jsonl"
 WALL_CLOCK = ("real_time_factor", "deadline_misses")
 """Metrics of the machine rather than the flight, left out because they differ from campaign to campaign."""
 PACKAGES = ("firmware_py", "hil", "can_dbc")
 SOURCES = (".py", ".toml", ".dbc")
-FEW = max(8, 2 * (os.cpu_count() or 1))
+TRIALS_AFTER_A_DEATH = max(8, 2 * (os.cpu_count() or 1))
 """Limit of trials under way after a worker has died: enough to keep this machine busy, and the most that the next death can cost."""
-IN_VAIN = 12
+MAX_DEATHS_IN_A_ROW = 12
 """Consecutive worker deaths without a finished trial after which the campaign gives up: no single seed is to blame."""
 
 
@@ -109,7 +109,7 @@ def run_campaign(
     Raises DescriptionError if `out` holds another campaign (which `anew` discards instead), a flight, or files of another origin, and for
     seeds that kill their workers; OSError if the disk is full.
     """
-    with made(out), writing_to(out):
+    with created_folder(out), writing_to(out):
         check_replaceable(out, (SUMMARY_FILE, TABLE_FILE, *LOGS), is_json_with(out / TRIALS_FILE, OWNER), "campaign")
         with TrialFile(out / TRIALS_FILE, identity(scenario, parameters), anew=anew) as file:
             missing = [seed for seed in seeds if seed not in file.trials]
@@ -125,15 +125,15 @@ def run_campaign(
 
 
 def _flown(scenario: Scenario, parameters: Parameters, seeds: Sequence[int], pool: Pool) -> Iterator[Trial]:
-    """Yields trials as they finish. Those under way when a worker dies are flown again after the others: FEW at a time, then one at a
-    time, twice.
+    """Yields trials as they finish. Those under way when a worker dies are flown again after the others: TRIALS_AFTER_A_DEATH at a
+    time, then one at a time, twice.
     """
     left, code, in_vain = set(seeds), code_digest(), 0
 
     def begin(executor: Executor, seed: int) -> Future[Trial]:
         return executor.submit(fly_trial, scenario, parameters, seed, f"virtual:trial{seed}", code)
 
-    for at_once in (len(left), FEW, 1, 1):
+    for at_once in (len(left), TRIALS_AFTER_A_DEATH, 1, 1):
         waiting = deque(sorted(left))
         while waiting:
             in_vain += 1
@@ -142,7 +142,7 @@ def _flown(scenario: Scenario, parameters: Parameters, seeds: Sequence[int], poo
                     left.discard(int(trial["seed"]))
                     in_vain = 0
                     yield trial
-            if in_vain == IN_VAIN:
+            if in_vain == MAX_DEATHS_IN_A_ROW:
                 raise DescriptionError(f"workers die before they finish a trial; {len(left)} seeds are left, {min(left)} the first")
     if left:
         named = ", ".join(map(str, sorted(left)))
@@ -164,7 +164,7 @@ def _together(begin: Callable[[int], Future[Trial]], waiting: deque[int], at_onc
                 future = ended.get()
                 under_way.remove(future)
                 trial = future.result()
-            except deaths():
+            except worker_death_exceptions():
                 died = True
             else:
                 yield trial

@@ -50,18 +50,18 @@ class Check(NamedTuple):
 
 
 class Result(NamedTuple):
-    """The result of a run. result.json holds all of it but `told` and `unseen`."""
+    """The result of a run. result.json holds all of it but `warnings` and `no_tag_reason`."""
 
     scenario: str
     seed: int
     passed: bool
     metrics: dict[str, float]
     checks: tuple[Check, ...]
-    told: tuple[str, ...] = ()
-    """Warnings of the firmware, a line each (hil.metrics.told)."""
+    warnings: tuple[str, ...] = ()
+    """Warnings of the firmware, a line each (hil.metrics.warning_lines)."""
     unusual: tuple[str, ...] = ()
     """Options that differ from the scenario or the defaults: vehicle, controller, sensors."""
-    unseen: str = ""
+    no_tag_reason: str = ""
     """Why no tag was seen, in words, if the flight could not be flown for that reason."""
 
     @property
@@ -89,10 +89,10 @@ def check_metrics(metrics: Mapping[str, float], limits: Iterable[Bounds]) -> tup
     return tuple(checks)
 
 
-def judge(scenario: str, seed: int, metrics: Mapping[str, float], limits: Iterable[Bounds], told: tuple[str, ...] = ()) -> Result:
+def judge(scenario: str, seed: int, metrics: Mapping[str, float], limits: Iterable[Bounds], warnings: tuple[str, ...] = ()) -> Result:
     """The result of a run: passed when every check passed and there is at least one."""
     checks = check_metrics(metrics, limits)
-    return Result(scenario, seed, bool(checks) and all(c.passed for c in checks), dict(metrics), checks, told)
+    return Result(scenario, seed, bool(checks) and all(c.passed for c in checks), dict(metrics), checks, warnings)
 
 
 def write_result(result: Result, folder: Path) -> Path:

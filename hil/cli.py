@@ -100,7 +100,7 @@ def run(
     folder = out if out is not None else Path("runs") / "-".join([chosen.name, *unusual, *([f"seed-{seed}"] if seed else [])])
     if realtime:
         check_reaches_others(bus, "--realtime", ("virtual:", "slcan:"))  # an adapter serves one process
-    with _told_where_the_log_is(folder), interrupted_once():
+    with _report_log_on_interrupt(folder), interrupted_once():
         with flight_progress(f"{chosen.name}, seed {seed}", chosen.duration_s) as progress:
             result = fly_and_judge(chosen, seed, parameters, folder, bus, rate_hz, progress, realtime, unusual)
         report = illustrate(chosen, result, folder) if plots else None
@@ -109,7 +109,7 @@ def run(
 
 
 @contextmanager
-def _told_where_the_log_is(folder: Path) -> Iterator[None]:
+def _report_log_on_interrupt(folder: Path) -> Iterator[None]:
     """When the run inside is interrupted, prints where its log is, or that nothing was flown."""
     log, before = folder / CAN_LOG, _written_at(folder / CAN_LOG)
     try:
@@ -161,7 +161,7 @@ def campaign(
     unusual = unusual_in(vehicle, controller, sensors)
     folder = out if out is not None else Path("runs") / "-".join([chosen.name, *unusual, "campaign"])
     parameters, seeds = parameters_of(controller), range(seed, seed + trials)
-    with _told_that_it_goes_on(), campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
+    with _report_resume_on_interrupt(), campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
         pool = dask_cluster(dask) if dask else processes(jobs)
         summary = run_campaign(chosen, parameters, seeds, pool, folder, progress)
     print_campaign(summary)
@@ -172,7 +172,7 @@ def campaign(
 
 
 @contextmanager
-def _told_that_it_goes_on() -> Iterator[None]:
+def _report_resume_on_interrupt() -> Iterator[None]:
     """When the campaign inside is interrupted, prints that the same command resumes it."""
     try:
         yield

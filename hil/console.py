@@ -18,9 +18,9 @@ from hil.campaign_summary import surely_not_zero
 from hil.checks import Result
 from hil.metrics import metric_order, shown, shown_limit, shown_value
 
-TOLD = ("position_rmse_m", "attitude_rmse_rad")
+SENSITIVITY_METRICS = ("position_rmse_m", "attitude_rmse_rad")
 """Metrics of a campaign for which correlated parameters of the world are printed."""
-TOLD_LINES = 6
+WARNING_LINES = 6
 """Number of warnings shown of a run."""
 
 
@@ -72,7 +72,7 @@ def print_campaign(summary: Mapping[str, Any], console: Console | None = None) -
     if failures:
         console.print(f"FAILED: {', '.join(failures)}", style="bold red", highlight=False)
     console.print(f"worst seeds: {', '.join(str(seed) for seed in summary['worst_seeds'])}", highlight=False)
-    looked_at = {metric: summary["sensitivities"].get(metric, {}) for metric in TOLD}
+    looked_at = {metric: summary["sensitivities"].get(metric, {}) for metric in SENSITIVITY_METRICS}
     pairs = sum(len(correlations) for correlations in looked_at.values())
     for metric, correlations in looked_at.items():
         if words := what_matters(correlations, pairs):
@@ -110,22 +110,22 @@ def result_table(result: Result) -> Table:
     return table
 
 
-def told_lines(told: Sequence[str]) -> list[str]:
+def warning_lines(warnings: Sequence[str]) -> list[str]:
     """The first warnings of the firmware under a heading, and the number of further ones; empty if there are none."""
-    more = [f"  and {len(told) - TOLD_LINES} more"] if len(told) > TOLD_LINES else []
-    return ["warnings of the firmware:", *(f"  {line}" for line in told[:TOLD_LINES]), *more] if told else []
+    more = [f"  and {len(warnings) - WARNING_LINES} more"] if len(warnings) > WARNING_LINES else []
+    return ["warnings of the firmware:", *(f"  {line}" for line in warnings[:WARNING_LINES]), *more] if warnings else []
 
 
 def print_result(result: Result, report: Path | None = None, console: Console | None = None) -> None:
     """Prints the table, the firmware's warnings, the verdict in one line, and the path of the report."""
     console = console or Console()
     console.print(result_table(result))
-    for line in told_lines(result.told):
+    for line in warning_lines(result.warnings):
         console.print(line, highlight=False, markup=False)
     failed = [shown(c.name).label for c in result.checks if not c.passed]
     verdict = f"FAILED: {'; '.join(failed)}" if failed else "passed" if result.passed else "FAILED: nothing was checked"
     console.print(verdict, style="green" if result.passed else "bold red", highlight=False)
-    if result.unseen:
-        console.print(result.unseen, highlight=False, markup=False, soft_wrap=True)
+    if result.no_tag_reason:
+        console.print(result.no_tag_reason, highlight=False, markup=False, soft_wrap=True)
     if report is not None:
         console.print(f"report: {report}", highlight=False, soft_wrap=True)

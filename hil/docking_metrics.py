@@ -28,7 +28,7 @@ UNSTABLE_RAD, KEPT_UP_TICKS = math.radians(30.0), 200
 """A body whose attitude stays this far from its set-point, for this many ticks, is out of control."""
 
 
-def wishes_of(scenario: Scenario) -> dict[tuple[int, int], list[Step]]:
+def dock_steps_by_pair(scenario: Scenario) -> dict[tuple[int, int], list[Step]]:
     """Dock and undock steps of each pair of modules (fleet indices, the lower first), in order."""
     pairs: dict[tuple[int, int], list[Step]] = {}
     for step in scenario.step:
@@ -117,7 +117,7 @@ def _later_dock(scenario: Scenario, last: Step, together: np.ndarray) -> list[St
 
 def is_as_asked(scenario: Scenario, truths: Mapping[str, Columns]) -> bool:
     """Whether all docks and undocks happened in order, with the faces that they name; without any, whether nothing joined or parted."""
-    together, pairs = _together(truths, truths["/plant/docks"]["tick"]), wishes_of(scenario)
+    together, pairs = _together(truths, truths["/plant/docks"]["tick"]), dock_steps_by_pair(scenario)
     if not pairs:
         return bool((together == together[0]).all())
     return all(

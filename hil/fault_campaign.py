@@ -21,14 +21,14 @@ from hil.bench import fly_scenario
 from hil.fault_table import AT_S, NUMBER, PLACED, ROWS, Row
 from hil.flight import LOGS
 from hil.metrics import errors
-from hil.replaceable import check_replaceable, is_json_with, made
+from hil.replaceable import check_replaceable, created_folder, is_json_with
 from hil.scenario import MODES, Scenario, load_scenario
 from hil.signals import Flight, read_flight
 from hil.workers import Pool
 
 SCENARIO = "faults"
 RESULT_FILE = "faults.json"
-BEFORE_S = 0.015
+LEAD_S = 0.015
 """Includes the tick before the fault, so that an immediate change is seen as a change."""
 BLAMED = re.compile(r"thruster (\d+) ")
 """Thruster named in an event, as it is when one is left out."""
@@ -69,7 +69,7 @@ def fly_cell(row: Row, mode: str, seed: int, parameters: Parameters | None = Non
 
 def judge(row: Row, mode: str, flight: Flight, vehicle: Vehicle) -> Cell:
     """What happened after the fault, and which promises it broke."""
-    after = flight.between(round((AT_S - BEFORE_S) * 1e9), 1 << 62)
+    after = flight.between(round((AT_S - LEAD_S) * 1e9), 1 << 62)
     time_s = after.firmware["time_ns"] * 1e-9 - AT_S
     names = [_name(int(state), int(now)) for state, now in zip(after.firmware["state"], after.firmware["mode"], strict=True)]
     wanted = row.ends.get(mode, mode)
@@ -136,7 +136,7 @@ def run_fault_campaign(pool: Pool, out: Path, seed: int = 0, progress: Callable[
 
     Raises DescriptionError if `out` holds a flight, or a faults.json that no campaign of faults wrote.
     """
-    with made(out):
+    with created_folder(out):
         check_replaceable(out, (RESULT_FILE, *LOGS), is_json_with(out / RESULT_FILE, "promise"), "campaign of faults")
         cells: list[Cell] = []
         with pool() as executor:

@@ -138,5 +138,5 @@ ROWS = (
         error_m=0.030, says="ground station silent", says_in=_all_but("AUTO", "SURFACE"), task={"ground_until_s": AT_S},
     ),
 )  # fmt: skip
-ALONE = tuple(row.fault for row in ROWS if row.fault is not None and not row.also)
+SINGLE_FAULTS = tuple(row.fault for row in ROWS if row.fault is not None and not row.also)
 """Faults that occur alone, without a second one."""

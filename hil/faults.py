@@ -98,15 +98,15 @@ class Faults:
         self._tags = stream(seed, "faults", 1024)
         axis = self._tags.standard_normal(3)
         self._bias_axis = axis / np.linalg.norm(axis)
-        hand = stream(seed, "push").standard_normal((2, 3))
-        self._hand, self._grip = hand / np.linalg.norm(hand, axis=1, keepdims=True)
+        vectors = stream(seed, "push").standard_normal((2, 3))
+        self._push_direction, self._push_arm = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
         self._breaks: dict[str, Callable[[Fault, Mcu], None]] = {
             **dict.fromkeys(THRUSTER_KINDS, self._break_thrusters),
             "imu_frozen": lambda fault, mcu: setattr(mcu, "frozen", True),
             "leak": lambda fault, mcu: setattr(mcu, "leaks", True),
-            "readings_absent": lambda fault, mcu: setattr(mcu, "unread", True),
+            "readings_absent": lambda fault, mcu: setattr(mcu, "readings_absent", True),
             "battery_sag": lambda fault, mcu: self._world.sag(mcu.module, fault.value),
-            "magnet": self._hang_magnets,
+            "magnet": self._stick_magnets,
             "jets": lambda fault, mcu: setattr(self._world, "jet_strength", fault.value),
             "push": self._push,
         }
@@ -182,12 +182,12 @@ class Faults:
         """
         self._world.jet_strength = self._world.spec.jet_strength
         for number, mcu in self._nodes.mcus.items():
-            mcu.frozen = mcu.leaks = mcu.unread = False
-            self._world.mend(mcu.module)
+            mcu.frozen = mcu.leaks = mcu.readings_absent = False
+            self._world.clear_faults(mcu.module)
             for fault in self._on:
                 if fault.kind in self._breaks and fault.module in (0, number):
                     self._breaks[fault.kind](fault, mcu)
-            self._world.docks.move_hung(mcu.module)
+            self._world.docks.apply_stuck(mcu.module)
 
     def _break_thrusters(self, fault: Fault, mcu: Mcu) -> None:
         for t in range(len(self._world.vehicles[mcu.module].thruster)):
@@ -196,11 +196,12 @@ class Faults:
 
     def _push(self, fault: Fault, mcu: Mcu) -> None:
         """Adds an external push on a point off the hull's centre: a force and a moment."""
-        self._world.push[mcu.module] += fault.value * np.concatenate([self._hand, PUSH_LEVER_M * np.cross(self._grip, self._hand)])
+        moment = PUSH_LEVER_M * np.cross(self._push_arm, self._push_direction)
+        self._world.push[mcu.module] += fault.value * np.concatenate([self._push_direction, moment])
 
-    def _hang_magnets(self, fault: Fault, mcu: Mcu) -> None:
+    def _stick_magnets(self, fault: Fault, mcu: Mcu) -> None:
         for face in range(FACES) if fault.index == ALL else (fault.index,):
-            self._world.docks.hang(mcu.module, face, RELAY.index(fault.value))
+            self._world.docks.stick_relay(mcu.module, face, RELAY.index(fault.value))
 
     def _change_tag(self, sighting: Sighting, carrier: int) -> Sighting | None:
         """Applies the faults to a sighting, world frame, by a camera on the module `carrier` (-1: a fixed camera); None: lost.

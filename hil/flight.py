@@ -24,11 +24,11 @@ from hil.checks import RESULT_FILE, Limit, Result, judge, write_result
 from hil.dock_plot import DOCK_PLOT, write_dock_plot
 from hil.docking_metrics import docking_metrics
 from hil.force_metrics import force_metrics
-from hil.metrics import PAPER_SPIRAL_RMSE_MM, Poses, flight_metrics, told
+from hil.metrics import PAPER_SPIRAL_RMSE_MM, Poses, flight_metrics, warning_lines
 from hil.plant.spec import Tank
 from hil.plots import PLOTS, Window, write_plots
 from hil.realtime import fly_in_real_time
-from hil.replaceable import check_replaceable, is_json_with, made
+from hil.replaceable import check_replaceable, created_folder, is_json_with
 from hil.report import REPORT_FILE, Scene, write_report
 from hil.scenario import Scenario
 from hil.script import Script
@@ -63,7 +63,7 @@ def fly_and_judge(
     """
     scenario = scenario.for_seed(seed)
     flight = (scenario, seed, parameters, out, bus, rate_hz, progress)
-    with made(out), _alone_in(out):
+    with created_folder(out), _alone_in(out):
         check_folder(out)
         if realtime:
             flown = fly_in_real_time(*flight, before_logs=partial(_clear, out))
@@ -124,11 +124,11 @@ def judge_logs(
     if scenario.task.kind == "force":
         metrics |= force_metrics(scenario, folder, begin_ns)
     always = [Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"])), *_armed_at_all(scenario, whole, folder)]
-    result = judge(scenario.name, seed, metrics, [*scenario.check, *always], told(whole.events, start_of(whole)))
-    return result if result.passed else result._replace(unseen=unseen(scenario, whole))
+    result = judge(scenario.name, seed, metrics, [*scenario.check, *always], warning_lines(whole.events, start_of(whole)))
+    return result if result.passed else result._replace(no_tag_reason=no_tag_reason(scenario, whole))
 
 
-def unseen(scenario: Scenario, whole: Flight) -> str:
+def no_tag_reason(scenario: Scenario, whole: Flight) -> str:
     """Why no tag was seen in the `whole` flight, in words; empty if one was seen, or if the robot was armed without."""
     if whole.placed.any() or np.isin(whole.firmware["state"], list(ARMED)).any():
         return ""

@@ -224,7 +224,7 @@ def warnings(severity: np.ndarray, text: np.ndarray) -> int:
     return int(np.count_nonzero((severity <= WARNING) & ~waiting))
 
 
-def told(events: Columns, start_ns: int) -> tuple[str, ...]:
+def warning_lines(events: Columns, start_ns: int) -> tuple[str, ...]:
     """Events of syslog severity warning or worse, each text once, in order: `1.0 s: ARM refused: no pose yet (12 x)`.
 
     Args:

@@ -61,13 +61,13 @@ class Mcu:
         self._accepted_ns: list[int | None] = [None, None]
         self._applied = [0.0] * 8
         self._last_estop_ns = 0
-        self._docked_ns = 0
+        self._last_dock_cmd_ns = 0
         self._power = Noise(stream(world.seed, "power", module), 2)
         self._rpm = Noise(stream(world.seed, "rpm", module), 8)
         self._dock = Noise(stream(world.seed, "dock", module), 6)
         self._fast = [codec.message(name) for name in ("GYRO", "ACCEL", "MCU_STATUS")]
         self._slow = _schedule(codec, number, tick_ns)
-        self.frozen = self.leaks = self.unread = False
+        self.frozen = self.leaks = self.readings_absent = False
         """Faults: the IMU repeats its last sample; water in the cabin; POWER and ENVIRONMENT are not sent."""
         self._motion: tuple[list[float], list[float]] | None = None
         self._counters = dict.fromkeys(SLOW, 0)
@@ -82,7 +82,7 @@ class Mcu:
         """When each half of THRUSTER_CMD was last accepted, on the plant's clock."""
         return tuple(self._accepted_ns)
 
-    def heard(self, name: str, values: Sequence[float], time_ns: int) -> None:
+    def handle(self, name: str, values: Sequence[float], time_ns: int) -> None:
         """Handles a checked message addressed to this module."""
         if name in ("THRUSTER_CMD_A", "THRUSTER_CMD_B"):
             half = 0 if name == "THRUSTER_CMD_A" else 1
@@ -92,7 +92,7 @@ class Mcu:
             if values[4] == 0 and time_ns - self._last_estop_ns >= RELEASE_NS:
                 self.stopped = False
         elif name == "DOCK_CMD":
-            self._docked_ns = time_ns
+            self._last_dock_cmd_ns = time_ns
             barred = REVERSE if self.stopped else None
             self._switch([OFF if v == barred else int(v) for v in values[:6]])
 
@@ -105,7 +105,7 @@ class Mcu:
 
     def watch(self, time_ns: int) -> None:
         """Runs the MCU's timeouts, independent of SYNC: zeroes each stale half of the command, and ends a push after PUSH_NS."""
-        if time_ns - self._docked_ns > PUSH_NS:
+        if time_ns - self._last_dock_cmd_ns > PUSH_NS:
             self._end_push()
         for half, accepted in enumerate(self._accepted_ns):
             if accepted is None or time_ns - accepted > TIMEOUT_NS:
@@ -131,7 +131,7 @@ class Mcu:
             accel.encode(self.number, [*self._motion[1], 0], tick),
         ]
         for message, every, phase in self._slow:
-            if tick % every == phase and not (self.unread and message.name in ("POWER", "ENVIRONMENT")):
+            if tick % every == phase and not (self.readings_absent and message.name in ("POWER", "ENVIRONMENT")):
                 counter = self._counters[message.name]
                 self._counters[message.name] = (counter + 1) & 15
                 frames.append(message.encode(self.number, self._reading(message.name, truth), counter))
@@ -264,7 +264,7 @@ class Nodes:
         answers: list[Frame] = []
         arrived = self.faults.incoming(frames, time_ns)
         for frame, row in zip(arrived, self.receiver.rows(arrived).tolist(), strict=True):
-            answers += self._hear(frame, row, time_ns)
+            answers += self._handle_frame(frame, row, time_ns)
         return self.faults.outgoing(answers, time_ns)
 
     def watch(self) -> None:
@@ -277,13 +277,13 @@ class Nodes:
 
     def take(self, frame: Frame, time_ns: int) -> list[Frame]:
         """Processes one frame from the bus at `time_ns`, plant clock, and returns the answers. Bad frames are counted and dropped."""
-        return self._hear(frame, self.receiver.rows((frame,)).tolist()[0], time_ns)
+        return self._handle_frame(frame, self.receiver.rows((frame,)).tolist()[0], time_ns)
 
-    def _hear(self, frame: Frame, row: list[float], time_ns: int) -> list[Frame]:
+    def _handle_frame(self, frame: Frame, row: list[float], time_ns: int) -> list[Frame]:
         """Processes one frame; `row`: the receiver's result for it."""
         which, number, values = int(row[MESSAGE]), row[NUMBER], row[VALUES:]
         if which < 0:
-            self._blame(frame, KINDS[~which])
+            self._set_error_bit(frame, KINDS[~which])
             return []
         name = self.codec.messages[which].name
         if name == "ESTOP":
@@ -297,10 +297,10 @@ class Nodes:
                 answers += mcu.sync(tick, time_ns)
             return answers
         if number in self.mcus:
-            self.mcus[int(number)].heard(name, values, time_ns)
+            self.mcus[int(number)].handle(name, values, time_ns)
         return []
 
-    def _blame(self, frame: Frame, kind: str) -> None:
+    def _set_error_bit(self, frame: Frame, kind: str) -> None:
         """Sets the error bit of a dropped frame in the status of the MCU it was addressed to."""
         mcu = self.mcus.get(frame.id & 0x1F)
         if mcu is not None:

@@ -16,7 +16,7 @@ from firmware_py.bus.port import Port, open_port
 from firmware_py.description.schema import DescriptionError
 from hil.faults import Faults
 from hil.nodes import Nodes, make_nodes
-from hil.replaceable import check_replaceable, made
+from hil.replaceable import check_replaceable, created_folder
 from hil.scenario import Scenario, make_world
 from hil.truth_log import TRUTH_LOG, TruthRecorder, is_truth_log
 
@@ -45,7 +45,7 @@ def serve_until_signal(scenario: Scenario, seed: int, bus: str, rate_hz: int, ou
         signal.signal(number, lambda *_: stop.set())
     with ExitStack() as stack:
         if out is not None:
-            stack.enter_context(made(out))
+            stack.enter_context(created_folder(out))
             check_replaceable(out, (TRUTH_LOG,), is_truth_log(out / TRUTH_LOG), "plant")
         plant = PlantProcess(scenario, seed, rate_hz, out)
         now_ns = started_clock()

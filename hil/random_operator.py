@@ -35,7 +35,7 @@ from firmware_py.description.parameters import Parameters, registry
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.prepare.paths import circle
 from hil.bench import Bench, open_bench
-from hil.fault_table import ALONE
+from hil.fault_table import SINGLE_FAULTS
 from hil.orders import Orders
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
@@ -45,12 +45,12 @@ SCENARIOS = ("dock", "mobius-2", "hover")
 """Two bodies that may dock, one body of two modules that may undock, and a single module."""
 ASK_EVERY, STREAM_EVERY = 25, 5
 """Ticks between random requests, and between stick positions and heartbeats of the ground station."""
-LEAVES = 0.01
+SILENCE_PROBABILITY = 0.01
 """Probability that the ground station falls silent, or returns, whenever a heartbeat is due."""
 FACING = (FACE_NAMES.index("-x"), FACE_NAMES.index("+x"))
 """Faces with which the second module of these scenarios meets the first."""
 MOST_FAULTS = 5
-BREAKS = [fault for fault in ALONE if fault.kind != "process_killed"]
+BREAKS = [fault for fault in SINGLE_FAULTS if fault.kind != "process_killed"]
 """Faults that may be drawn: those of the fault matrix that come alone, except a killed process, which forgets its requests."""
 REGISTRY = tuple(registry())
 SOON = 2
@@ -72,7 +72,7 @@ class RandomOperator(Orders):
             return []
         body, tick, asked = int(self._rng.choice([record.body for record in last.records])), last.tick + 1, list[Request]()
         if tick % STREAM_EVERY == 0:
-            self._is_there ^= self._rng.random() < LEAVES
+            self._is_there ^= self._rng.random() < SILENCE_PROBABILITY
             if self._is_there:
                 asked += [Request(Action.GROUND_ALIVE), Request(Action.STICKS, body, self._sticks())]
         if tick % ASK_EVERY == 0:
@@ -156,7 +156,7 @@ class Seen(NamedTuple):
     """State of the module's body in the previous tick."""
     was_armed: bool
     """Whether its body contains a module that was armed in the previous tick: this one, or one that it has docked to."""
-    told_ago: Mapping[Action, float]
+    ticks_since_request: Mapping[Action, float]
     """Ticks since the last request for each action."""
 
 
@@ -170,10 +170,12 @@ RULES: Mapping[str, Callable[[Seen], bool]] = {
     "commands are shares": lambda s: bool((np.abs(s.command.thrusters) <= 1.0).all()),
     "who is not armed turns nothing": lambda s: s.record.state in ARMED or not (s.command.armed or s.command.thrusters.any()),
     "nobody arms unasked": lambda s: (
-        s.record.state not in ARMED or s.was_armed or min(s.told_ago[Action.ARM], s.told_ago[Action.MOTOR_TEST]) <= SOON
+        s.record.state not in ARMED
+        or s.was_armed
+        or min(s.ticks_since_request[Action.ARM], s.ticks_since_request[Action.MOTOR_TEST]) <= SOON
     ),
     "an e-stop stands until it is cleared": lambda s: (
-        s.before != State.ESTOP or s.record.state == State.ESTOP or s.told_ago[Action.CLEAR_ESTOP] <= SOON
+        s.before != State.ESTOP or s.record.state == State.ESTOP or s.ticks_since_request[Action.CLEAR_ESTOP] <= SOON
     ),
     "signals are numbers": lambda s: _is_finite(s.record),
 }  # fmt: skip
@@ -220,7 +222,7 @@ def _fault(rng: np.random.Generator, duration_s: float) -> Fault:
 
 def _seen(bench: Bench, operator: RandomOperator, outputs: Outputs, before: Mapping[int, int]) -> dict[int, Seen]:
     """Input of the rules after a tick, by module; `before`: state of each module's body in the previous tick."""
-    bodies, told_ago = bench.firmware.pipeline.bodies, {action: outputs.tick - tick for action, tick in operator.asked.items()}
+    bodies, ticks_since_request = bench.firmware.pipeline.bodies, {action: outputs.tick - tick for action, tick in operator.asked.items()}
     records = {record.body: record for record in outputs.records}
     seen = {}
     for module, command in enumerate(outputs.modules):
@@ -228,5 +230,5 @@ def _seen(bench: Bench, operator: RandomOperator, outputs: Outputs, before: Mapp
         holder = holders[0] if holders else bodies[0]  # a module of no body breaks the first rule in any case
         was_armed = any(before.get(other) in ARMED for other in holder.modules)
         record, state = records[holder.index], before.get(module, State.DISARMED)
-        seen[module] = Seen(len(holders), record, command, state, was_armed, told_ago)
+        seen[module] = Seen(len(holders), record, command, state, was_armed, ticks_since_request)
     return seen

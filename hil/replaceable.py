@@ -25,7 +25,7 @@ def check_replaceable(folder: Path, names: Iterable[str], is_earlier_run: bool, 
 
 
 @contextmanager
-def made(folder: Path) -> Iterator[None]:
+def created_folder(folder: Path) -> Iterator[None]:
     """Makes `folder` and its parents; at the end removes those of them that it made and that are empty. Raises OSError."""
     new = [each for each in (folder, *folder.parents) if not each.exists()]
     try:

@@ -22,7 +22,7 @@ from firmware_py.core.setpoint import rest_at
 from firmware_py.core.types import Action, Inputs, Mode, Outputs, Request, Sticks
 from firmware_py.description.parameters import Parameters
 from hil.bench import fly_scenario, open_bench
-from hil.fault_table import ALONE
+from hil.fault_table import SINGLE_FAULTS
 from hil.flight import wanted_in
 from hil.metrics import Poses, errors, flight_metrics, rms
 from hil.orders import Orders
@@ -196,7 +196,7 @@ class StoppedFlight(NamedTuple):
 def fly_to_estop(seed: int) -> StoppedFlight:
     """A short flight in a mode and with a fault drawn from the seed, an e-stop at a random time, and random requests after it."""
     rng = stream(seed, "estop")
-    faults = [fault for fault in ALONE if fault.kind not in OWN_FIGURES and not (fault.kind == "frame_loss" and fault.value == 1.0)]
+    faults = [fault for fault in SINGLE_FAULTS if fault.kind not in OWN_FIGURES and not (fault.kind == "frame_loss" and fault.value == 1.0)]
     fault = dataclasses.replace(faults[int(rng.integers(len(faults)))], at_s=float(rng.uniform(1.5, 4.5)), until_s=1e6)
     at_s, by_frame = float(rng.uniform(1.5, 4.5)), bool(rng.random() < 0.5)
     box = (Fault(kind="estop", at_s=at_s, until_s=at_s + float(rng.uniform(0.1, 1.0))),) if by_frame else ()

@@ -92,7 +92,7 @@ def read_flight(folder: Path) -> Flight:
         raise ValueError(f"{folder}: the two logs share no tick")
     nothing: Columns = {name: np.zeros(0, np.int64) for name in ("tick", "severity", "log_time")} | {"text": np.zeros(0, str)}
     believed, true = rows_of(firmware, mine), rows_of(truth, theirs)
-    _tell_of_same_body(believed, true, thrusters)
+    _use_pose_of_steered_body(believed, true, thrusters)
     ticks = signals["/firmware/ticks"]
     untold = np.concatenate([np.setdiff1d(firmware["tick"], truth["tick"]), np.setdiff1d(truth["tick"], ticks["tick"])])
     lost_ns = ticks["time_ns"][0] + period_of(ticks) * (untold - ticks["tick"][0])
@@ -134,7 +134,7 @@ def _at(columns: Columns, ticks: np.ndarray, name: str) -> np.ndarray:
     return columns[name][np.searchsorted(columns["tick"], ticks)]
 
 
-def _tell_of_same_body(firmware: Columns, truth: Columns, thrusters: int) -> None:
+def _use_pose_of_steered_body(firmware: Columns, truth: Columns, thrusters: int) -> None:
     """Replaces the true pose in ticks in which truth and firmware disagree about the modules of the body: between the tick in which faces
     lock or open and the one in which the firmware notices. The new pose is that of the body that the firmware still steers: its leading
     module's, with the rigid offset from the last (else the next) tick in which both saw that number of modules.

@@ -22,14 +22,14 @@ class TrialFile:
     """trials.jsonl: a line for the owner, then a line per trial, each synced to disk before the next trial is awaited."""
 
     def __init__(
-        self, path: Path, owner: str, key: str = "seed", anew: bool = False, who: str = "scenario, controller or code"
+        self, path: Path, owner: str, key: str = "seed", anew: bool = False, owner_kinds: str = "scenario, controller or code"
     ) -> None:
         """Continues `path` if it belongs to `owner`; drops a torn line and everything after it, to be flown again.
 
         Args:
             key: identifies a trial.
             anew: discards the trials of another owner.
-            who: what may distinguish another owner, for the error message.
+            owner_kinds: what may distinguish another owner, for the error message.
 
         Raises:
             DescriptionError: `path` is being written, holds trials of another owner, or is not a file of trials.
@@ -40,7 +40,7 @@ class TrialFile:
         with ExitStack() as refused:
             self._file = refused.enter_context(path.open("a+b"))
             self._claim(path)
-            stands = self._read(path, {OWNER: owner}, "" if anew else who)
+            stands = self._read(path, {OWNER: owner}, "" if anew else owner_kinds)
             self._file.truncate(stands)
             if not stands:
                 self._write({OWNER: owner})
@@ -53,16 +53,16 @@ class TrialFile:
         except BlockingIOError:
             raise DescriptionError(f"{path} is being written by another campaign; wait for it or give another --out") from None
 
-    def _read(self, path: Path, head: Trial, who: str) -> int:
+    def _read(self, path: Path, head: Trial, owner_kinds: str) -> int:
         """Reads the trials; returns the number of valid bytes, 0 if the head is another's.
 
-        Raises DescriptionError for trials of another owner, unless `who` is empty, and for a file that holds no trials.
+        Raises DescriptionError for trials of another owner, unless `owner_kinds` is empty, and for a file that holds no trials.
         """
         self._file.seek(0)
         lines = self._file.readlines()
         if not lines or _entry(lines[0]) != head:
-            if lines[1:] and who:
-                raise DescriptionError(f"{path} holds trials of another {who}; give another --out or delete it")
+            if lines[1:] and owner_kinds:
+                raise DescriptionError(f"{path} holds trials of another {owner_kinds}; give another --out or delete it")
             if lines and not (lines[0].startswith(_HEAD) or _HEAD.startswith(lines[0])):
                 raise DescriptionError(f"{path} holds no trials; move what is yours or give another --out")
             return 0

@@ -24,7 +24,7 @@ HEADER_BYTES = 64
 """Upper bound on the size of magic and header."""
 CHUNK_BYTES = 65536
 """About two seconds of one module at 100 Hz. A killed bench loses at most one chunk and the waiting messages."""
-AT_ONCE = 20
+BATCH_MESSAGES = 20
 """Messages that are encoded and written as one batch, ten ticks of one module, so that the code for it stays in the cache."""
 
 
@@ -147,7 +147,7 @@ class TruthRecorder:
 
     def _add(self, channel: int, time_ns: int, row: Row, values: tuple[Any, ...]) -> None:
         self._waiting.append((channel, time_ns, row, values))
-        if len(self._waiting) >= AT_ONCE:
+        if len(self._waiting) >= BATCH_MESSAGES:
             self._write()
 
     def _write(self) -> None:

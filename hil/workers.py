@@ -79,7 +79,7 @@ def end_with_parent() -> None:
 
 
 @contextmanager
-def kept(pool: Pool) -> Iterator[Pool]:
+def reused(pool: Pool) -> Iterator[Pool]:
     """The pool with its workers kept between uses, because starting them takes longer than a flight. A broken pool is replaced."""
     with ExitStack() as stack:
         executors: list[Executor] = []
@@ -159,7 +159,7 @@ def _dask_client(address: str) -> Any:
         raise DescriptionError(f"no dask scheduler at {address}: {error}; start one with `dask scheduler`") from None
 
 
-def deaths() -> tuple[type[BaseException], ...]:
+def worker_death_exceptions() -> tuple[type[BaseException], ...]:
     """Exceptions of a future whose worker has died. Dask has one of its own, and cancels all futures when its scheduler is gone."""
     dask = sys.modules.get("distributed")
     return (BrokenExecutor, CancelledError, *((dask.KilledWorker,) if dask else ()))

@@ -14,7 +14,7 @@ import typer
 from typer.exceptions import TyperException
 
 from firmware_py.description.schema import DescriptionError
-from hil.replaceable import check_replaceable, is_json_with, made
+from hil.replaceable import check_replaceable, created_folder, is_json_with
 
 
 def whole(least: int) -> Callable[[str], int]:
@@ -67,7 +67,7 @@ def folder_for_results(out: Path | None) -> Iterator[None]:
     with ExitStack() as stack:
         if out is not None:
             with suppress(OSError):  # _try_folder reports the cause
-                stack.enter_context(made(out))
+                stack.enter_context(created_folder(out))
             _try_folder(out, out)
         yield
 

@@ -32,7 +32,7 @@ from firmware_py.description.toml_text import to_toml
 from firmware_py.runtime.interrupts import interrupted_once
 from hil.campaign import TRIALS_FILE, code_digest, identity, run_campaign
 from hil.trial_file import TrialFile
-from hil.workers import Pool, dask_cluster, kept, processes
+from hil.workers import Pool, dask_cluster, processes, reused
 
 DETUNED = 3.0
 """Largest factor by which --detune changes each gain."""
@@ -93,7 +93,7 @@ def tune(objective: Objective, start: Parameters, given: argparse.Namespace, poo
 
     began = time.monotonic()
     figures = {}
-    with kept(pool) as workers:
+    with reused(pool) as workers:
         with workers() as executor:
             study = search(objective, start, given.trials, given.out, executor, given.seed, tell, began + 60.0 * given.minutes)
         if not any(trial.state == TrialState.COMPLETE for trial in study.trials):

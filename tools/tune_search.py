@@ -83,8 +83,8 @@ def search(
     bounds = {s.parameter: FloatDistribution(s.low, s.high, log=s.logarithmic) for s in objective.search}
     sampler = GaussianProcessSampler(bounds, seed, FIRST_AT_RANDOM)
     study = optuna.create_study(sampler=sampler, pruner=optuna.pruners.MedianPruner(n_startup_trials=4))
-    who = "objective, start, seed or code"
-    with TrialFile(out / TRIALS_FILE, identity(objective, start, seed), key="number", who=who) as file:
+    owner_kinds = "objective, start, seed or code"
+    with TrialFile(out / TRIALS_FILE, identity(objective, start, seed), key="number", owner_kinds=owner_kinds) as file:
         for number in sorted(file.trials):
             study.add_trial(_restored(file.trials[number], bounds))
         while len(file.trials) < trials and time.monotonic() < end_s:

@@ -30,10 +30,10 @@ from hil.plant.vectors import (
     cross,
     inlined,
     mass_of,
+    mass_times,
     matrix,
     matrix_of,
     minus,
-    momenta,
     plus,
     six,
     times,
@@ -133,11 +133,11 @@ def respond(rigid, added, inverse, r, v, w, flow, flow_rate, f, n):
     u = turn_back(r, flow)
     slip = minus(v, u)
     carried = minus(cross(w, u), turn_back(r, flow_rate))  # dv_r/dt = dv/dt + carried
-    (p, spin), (h, swirl) = momenta(rigid, v, w), momenta(added, slip, w)
+    (p, spin), (h, swirl) = mass_times(rigid, v, w), mass_times(added, slip, w)
     f = minus(minus(f, turn(added[0], carried)), cross(w, plus(p, h)))
     n = minus(minus(n, turn(added[2], carried)), cross(w, plus(spin, swirl)))
     n = minus(minus(n, cross(v, p)), cross(slip, h))
-    return momenta(inverse, f, n)
+    return mass_times(inverse, f, n)
 
 
 @inlined
@@ -292,7 +292,7 @@ def observe(bodies, modules, rates, gravity, out):
 
 
 @compiled(types.void(F1, V3, F1))
-def steered(x, nominal, out):
+def nominal_centre_motion(x, nominal, out):
     """Writes position (0:3) and velocity (3:6) of the nominal centre of mass, world.
 
     Args:

@@ -14,7 +14,7 @@ from firmware_py.core import rotations
 from firmware_py.description.vehicle import Vehicle
 from hil.plant import shelter
 from hil.plant.bodies import Bodies, Modules
-from hil.plant.draw import ModuleDraw, carried
+from hil.plant.draw import ModuleDraw, mass_about_body_origin
 from hil.plant.lattice import Place
 from hil.plant.spec import WorldSpec
 from hil.plant.thrusters import Thrusters
@@ -153,8 +153,8 @@ def fill_body(
     for array in bodies[1:6]:  # all but state, working memory and clamp
         array[b] = 0.0
     for draw, r, turn in parts:
-        bodies.rigid[b] += carried(draw.rigid, r, turn)
-        bodies.added[b] += carried(np.diag(draw.added), r, turn)
+        bodies.rigid[b] += mass_about_body_origin(draw.rigid, r, turn)
+        bodies.added[b] += mass_about_body_origin(np.diag(draw.added), r, turn)
         weight = draw.mass * spec.gravity
         bodies.weight[b, 0] += weight
         bodies.weight[b, 1] += draw.buoyancy_n

@@ -86,7 +86,7 @@ def face_to(r, d):
 
 
 @callee
-def _bear(plane, normal, p, v, w, faces):
+def _surface_traction(plane, normal, p, v, w, faces):
     """Pressure and friction on the second of two hulls, N/m^2, at a point p of the surface between them. All in the first hull's frame.
 
     Args:
@@ -103,7 +103,7 @@ def _bear(plane, normal, p, v, w, faces):
 
 
 @callee
-def _press(modules, faces, x, i, j, seats, wrench):
+def _add_hull_contact(modules, faces, x, i, j, seats, wrench):
     """Adds the contact force between the overlapping hulls i and j.
 
     Each hull is a bed of springs whose pressure rises with the depth below the nearest face. The contact surface is where both depths
@@ -126,7 +126,7 @@ def _press(modules, faces, x, i, j, seats, wrench):
             share, normal, p_1, p_2, p_3 = patch(faces.outline, faces.planes, count, a, b, middle, room, deepest)
             if share > 0.0:
                 for p in (p_1, p_2, p_3):
-                    push = times(share, _bear(faces.planes[a], normal, p, v, w, faces))
+                    push = times(share, _surface_traction(faces.planes[a], normal, p, v, w, faces))
                     f, moment = plus(f, push), plus(moment, cross(p, push))
     push_apart(wrench, x, first, second, p_i, turn(r_i, f))
     turn_apart(wrench, x, first, second, turn(r_i, moment))
@@ -174,7 +174,7 @@ def mating(modules, faces, x, i, j):
 
 
 @callee
-def _mate(modules, faces, x, i, j, seats, wrench):
+def _add_docking_forces(modules, faces, x, i, j, seats, wrench):
     """Adds the forces of magnets, funnel and jam between the two faces that face each other."""
     (f_i, f_j), (n_i, n_j), (_, b), gap, side = _facing(modules, i, j, seats)
     if faces.kind[i, f_i] * faces.kind[j, f_j] >= 0.0:
@@ -222,11 +222,11 @@ def near(modules, x, i, j):
 
 
 @callee
-def _meet(modules, faces, x, i, j, wrench):
+def _add_pair_forces(modules, faces, x, i, j, wrench):
     """Adds all forces between two modules i and j that are near each other."""
     seats = (pose_of(modules, x, i), pose_of(modules, x, j))
-    _press(modules, faces, x, i, j, seats, wrench)
-    _mate(modules, faces, x, i, j, seats, wrench)
+    _add_hull_contact(modules, faces, x, i, j, seats, wrench)
+    _add_docking_forces(modules, faces, x, i, j, seats, wrench)
 
 
 @callee
@@ -236,7 +236,7 @@ def interact(bodies, modules, faces, x):
     for i in range(count):
         for j in range(i + 1, count):
             if _is_near(modules, x, i, j):
-                _meet(modules, faces, x, i, j, bodies.wrench)
+                _add_pair_forces(modules, faces, x, i, j, bodies.wrench)
 
 
 @compiled(types.void(BODIES, MODULES, FACES, WATER, I1))
@@ -252,4 +252,4 @@ def touch(bodies, modules, faces, water, chosen):
     for i in range(count):
         for j in range(i + 1, count):
             if chosen[i] + chosen[j] > 0 and _is_near(modules, x, i, j):
-                _meet(modules, faces, x, i, j, bodies.wrench)
+                _add_pair_forces(modules, faces, x, i, j, bodies.wrench)

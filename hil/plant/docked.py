@@ -15,7 +15,7 @@ from hil.plant.build import fill_body, make_bodies, make_modules, nominal_centre
 from hil.plant.contact import touch
 from hil.plant.docking import DISK_M, Docks, Joint, joints_between
 from hil.plant.draw import ModuleDraw
-from hil.plant.joining import Hanging, centre_of, force_needed, hanging, motion_of, pieces, seats_after_join
+from hil.plant.joining import SupportedPart, centre_of, force_needed, motion_of, pieces, seats_after_join, supported_part
 from hil.plant.lattice import QUATERNIONS, Place, nearest
 from hil.plant.spec import WorldSpec
 from hil.plant.thrusters import Thrusters
@@ -53,9 +53,9 @@ class DockedBodies(ABC):
     _held: set[int]
     """One module of each body held by a load cell."""
     _stage: np.ndarray
-    _hanging: dict[Joint, Hanging | None]
-    """Cache of `_find_hanging` by joint, cleared when a joint opens or closes; None: other joints hold as well."""
-    _hands: np.ndarray
+    _supported_parts: dict[Joint, SupportedPart | None]
+    """Cache of `_find_supported_part` by joint, cleared when a joint opens or closes; None: other joints hold as well."""
+    _module_wrenches: np.ndarray
     """(m, 6) wrench of jets and external pushes on each module, about O of its body, body frame."""
 
     @abstractmethod
@@ -77,9 +77,9 @@ class DockedBodies(ABC):
             self._body_arrays.clamped[b] = not self._held.isdisjoint(members)
         self._stage = np.zeros((6, len(self.bodies), 13))
         self._external = np.zeros((len(self.bodies), 6))
-        self._hands = np.zeros((len(self.vehicles), 6))
+        self._module_wrenches = np.zeros((len(self.vehicles), 6))
         self._thrust = np.zeros((len(self.bodies), 6))
-        self._hanging = {}
+        self._supported_parts = {}
 
     def join(self, joint: Joint) -> None:
         """Merges the two bodies that `joint` links, and closes every other joint that then meets. Conserves momentum and centre of mass; a
@@ -127,7 +127,7 @@ class DockedBodies(ABC):
         """Opens a joint; a part held by no other joint becomes a body of its own, with unchanged motion."""
         b = int(self._modules.body[joint.module])
         self.docks.parted(joint)
-        self._hanging = {}
+        self._supported_parts = {}
         parts = pieces(self.bodies[b], self.docks.joints)
         if len(parts) == 1:
             return
@@ -161,29 +161,29 @@ class DockedBodies(ABC):
 
         A bending moment counts as a force at the rim of the disk; the pins carry the moment about the face normal.
         """
-        if joint not in self._hanging:
-            self._hanging[joint] = self._find_hanging(joint)
-        far = self._hanging[joint]
+        if joint not in self._supported_parts:
+            self._supported_parts[joint] = self._find_supported_part(joint)
+        far = self._supported_parts[joint]
         if far is None:
             return 0.0
         b = int(self._modules.body[joint.module])
         need = force_needed(far, self._body_arrays.state[b], self._stage[5, b])
         for m in far.members:
             pushing = slice(*np.searchsorted(self._thrusters.module, (m, m + 1)))
-            need -= self._thrusters.force[pushing] @ self._thrusters.column[pushing] + self._hands[m]
+            need -= self._thrusters.force[pushing] @ self._thrusters.column[pushing] + self._module_wrenches[m]
         need -= self._touch_on(far.members)[b]
         outward, side = self._modules.turn[joint.module] @ FACE_NORMALS[joint.face], 1.0 if joint.other in far.members else -1.0
         at = self._modules.position[joint.module] + 0.5 * self._modules.size[joint.module, joint.face // 2] * outward
         bending = rotations.cross(outward, need[3:] - rotations.cross(at, need[:3]))
         return float(-side * outward @ need[:3] + np.linalg.norm(bending) / DISK_M)
 
-    def _find_hanging(self, joint: Joint) -> Hanging | None:
+    def _find_supported_part(self, joint: Joint) -> SupportedPart | None:
         """The part held by `joint` alone: the unclamped side, preferably that of `joint.other`; None where other joints hold it too."""
         parts = pieces(self.bodies[int(self._modules.body[joint.module])], [j for j in self.docks.joints if j != joint])
         if len(parts) == 1:
             return None
         free = [piece for piece in parts if self._held.isdisjoint(piece)] or parts
-        return hanging(self._draws, self._modules, next((p for p in free if joint.other in p), free[0]), self.spec.gravity)
+        return supported_part(self._draws, self._modules, next((p for p in free if joint.other in p), free[0]), self.spec.gravity)
 
     def _touch_on(self, members: Sequence[int]) -> np.ndarray:
         """(b, 6) wall and contact forces on these modules of one body, in that body's row, body frame."""

@@ -76,7 +76,7 @@ class Docks:
         self.contacts: list[Contact] = []
         self.gap_m = self.lateral_m = math.nan
         """Gap and lateral error between the pair of faces that is nearest to docking; nan: none is near."""
-        self._hung = np.full((m, 6), -1, dtype=np.int64)
+        self._stuck = np.full((m, 6), -1, dtype=np.int64)
         self._surge = np.zeros((m, 6))
         self._engaged = np.zeros((m, 6))
         self.busy = False
@@ -86,22 +86,22 @@ class Docks:
 
     def set_relays(self, module: int, relays: Sequence[int]) -> None:
         """Applies the relay states of a DOCK_CMD to one module's six coils; stuck relays keep theirs."""
-        wanted = np.where(self._hung[module] >= 0, self._hung[module], np.array(relays, dtype=np.int64))
+        wanted = np.where(self._stuck[module] >= 0, self._stuck[module], np.array(relays, dtype=np.int64))
         changed = wanted != self.relays[module]
         if changed.any():
             self._surge[module, changed] = 1.0
             self.relays[module] = wanted
             self.busy = True
 
-    def hang(self, module: int, face: int, relay: int) -> None:
-        """Fault: makes a relay stick in the state `relay`; it takes effect at `move_hung` or the next command."""
-        self._hung[module, face] = relay
+    def stick_relay(self, module: int, face: int, relay: int) -> None:
+        """Fault: makes a relay stick in the state `relay`; it takes effect at `apply_stuck` or the next command."""
+        self._stuck[module, face] = relay
 
-    def free(self, module: int) -> None:
+    def unstick_relays(self, module: int) -> None:
         """Ends the stuck-relay faults of a module; the relays obey again from the next command on."""
-        self._hung[module] = -1
+        self._stuck[module] = -1
 
-    def move_hung(self, module: int) -> None:
+    def apply_stuck(self, module: int) -> None:
         """Switches all stuck relays of a module to the states in which they stick."""
         self.set_relays(module, self.relays[module].tolist())
 

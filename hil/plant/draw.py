@@ -115,7 +115,7 @@ def rigid_matrix(mass: float, com: np.ndarray, inertia: np.ndarray) -> np.ndarra
     return np.block([[mass * np.eye(3), -mass * s], [mass * s, inertia - mass * s @ s]])
 
 
-def carried(matrix: np.ndarray, position: np.ndarray, turn: np.ndarray) -> np.ndarray:
+def mass_about_body_origin(matrix: np.ndarray, position: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """Transforms a (6, 6) mass matrix about a module's origin to O of its body: H^T M H.
 
     H maps [v; w] of O in the body frame to [v; w] of the module in the module frame: v_m = T^T (v + w x r), w_m = T^T w.

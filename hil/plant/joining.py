@@ -11,7 +11,7 @@ from firmware_py.core import rotations
 from firmware_py.description.vehicle import FACE_NORMALS
 from hil.plant.bodies import Bodies, Modules
 from hil.plant.docking import Joint
-from hil.plant.draw import ModuleDraw, carried
+from hil.plant.draw import ModuleDraw, mass_about_body_origin
 from hil.plant.lattice import QUATERNIONS, Place, nearest
 
 
@@ -74,7 +74,7 @@ def centre_of(bodies: Bodies, b: int) -> np.ndarray:
     return np.array([rigid[5, 1], rigid[3, 2], rigid[4, 0]]) / rigid[0, 0]
 
 
-class Hanging(NamedTuple):
+class SupportedPart(NamedTuple):
     """Part of a body held by a single joint: its modules, mass and weight. Body frame, about O."""
 
     members: tuple[int, ...]
@@ -86,19 +86,19 @@ class Hanging(NamedTuple):
     """(3,) N m: first moment of that weight; its moment is the cross product with the direction down."""
 
 
-def hanging(draws: Sequence[ModuleDraw], modules: Modules, members: Sequence[int], gravity: float) -> Hanging:
+def supported_part(draws: Sequence[ModuleDraw], modules: Modules, members: Sequence[int], gravity: float) -> SupportedPart:
     """Returns the part of a body that consists of these modules."""
     mass, weight_n, weight_at = np.zeros((6, 6)), 0.0, np.zeros(3)
     for m in members:
         d, r, turn = draws[m], modules.position[m], modules.turn[m]
-        mass += carried(d.rigid + np.diag(d.added), r, turn)
+        mass += mass_about_body_origin(d.rigid + np.diag(d.added), r, turn)
         w = d.mass * gravity
         weight_n += w - d.buoyancy_n
         weight_at += w * (r + turn @ d.com) - d.buoyancy_n * (r + turn @ d.buoyancy_at)
-    return Hanging(tuple(members), mass, weight_n, weight_at)
+    return SupportedPart(tuple(members), mass, weight_n, weight_at)
 
 
-def force_needed(part: Hanging, x: np.ndarray, rate: np.ndarray) -> np.ndarray:
+def force_needed(part: SupportedPart, x: np.ndarray, rate: np.ndarray) -> np.ndarray:
     """(6,) wrench about O, body frame, that part of a body needs in addition to its weight for the present motion.
 
     x, rate: (13,) state of the body and its derivative. Assumes still water and neglects drag, which acts on all modules and is small

@@ -28,7 +28,7 @@ def _put(array, row, a):
 
 
 @callee
-def _size(a):
+def _absolute(a):
     """Absolute value of each component."""
     return (abs(a[0]), abs(a[1]), abs(a[2]))
 
@@ -36,7 +36,7 @@ def _size(a):
 @callee
 def shared_box(half, other, r, at):
     """Centre and half edges of a box, aligned with the first one, that contains the overlap; arguments as in `faces_that_meet`."""
-    reach = (dot(other, _size(r[0])), dot(other, _size(r[1])), dot(other, _size(r[2])))
+    reach = (dot(other, _absolute(r[0])), dot(other, _absolute(r[1])), dot(other, _absolute(r[2])))
     low = (max(-half[0], at[0] - reach[0]), max(-half[1], at[1] - reach[1]), max(-half[2], at[2] - reach[2]))
     high = (min(half[0], at[0] + reach[0]), min(half[1], at[1] + reach[1]), min(half[2], at[2] + reach[2]))
     return times(0.5, plus(low, high)), times(0.5, minus(high, low))
@@ -47,7 +47,7 @@ def _least_overlap(half, other, r, at):
     """Smallest overlap along an axis of the first box, m, and that axis; arguments as in `faces_that_meet`."""
     axis, least = 0, math.inf
     for k in range(3):
-        overlap = half[k] + dot(other, _size(r[k])) - abs(at[k])
+        overlap = half[k] + dot(other, _absolute(r[k])) - abs(at[k])
         if overlap < least:
             axis, least = k, overlap
     return least, axis
@@ -61,7 +61,7 @@ def _list_faces(planes, n, half, middle, room, deepest, normal, place):
         middle, room: of `shared_box`. deepest: largest depth of such a point, m.
         normal, place: of the face of the other box that looks at this one; all points of the overlap are behind it.
     """
-    before = place - dot(normal, middle) + dot(_size(normal), room)  # how far the deepest corner of the overlap is behind that face
+    before = place - dot(normal, middle) + dot(_absolute(normal), room)  # how far the deepest corner of the overlap is behind that face
     for k in range(3):
         for sign in (1.0, -1.0):
             top, bottom = sign * middle[k] + room[k], max(sign * middle[k] - room[k], half[k] - deepest)
@@ -196,12 +196,12 @@ def patch(outlines, planes, count, a, b, middle, room, deepest):
     n_a, n_b = triple(planes, a, 0), triple(planes, b, 0)
     apart = minus(n_a, n_b)
     shift, square = planes[a, 3] - planes[b, 3] - dot(apart, middle), dot(apart, apart)
-    if square < SAME * SAME or abs(shift) > dot(room, _size(apart)):
+    if square < SAME * SAME or abs(shift) > dot(room, _absolute(apart)):
         return 0.0, apart, apart, apart, apart
     start, (across, line) = plus(middle, times(shift / square, apart)), _axes_along(n_a, n_b, apart)
     # The depth is zero on the line where the two faces meet and rises from there; the patch ends where it exceeds `deepest`.
     rise, depth, scale = -dot(n_a, across), planes[a, 3] - dot(n_a, start), 1.0 / dot(across, across)
-    high, side = scale * dot(room, _size(across)), dot(room, _size(line)) / dot(line, line)
+    high, side = scale * dot(room, _absolute(across)), dot(room, _absolute(line)) / dot(line, line)
     low = -high
     if rise * rise * scale > PARALLEL * PARALLEL:
         ends = (-depth / rise, (deepest - depth) / rise)

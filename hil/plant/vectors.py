@@ -85,7 +85,7 @@ def column(r, k):
 
 
 @inlined
-def momenta(mass, v, w):
+def mass_times(mass, v, w):
     """Linear and angular momentum of a body with velocity v and rate w: the product of `mass` (see `mass_of`) and (v, w)."""
     p, spin = (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
     for j in range(3):

@@ -14,7 +14,7 @@ from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
 from hil.plant import thrusters as thrusters_module
-from hil.plant.bodies import Bodies, Modules, steered
+from hil.plant.bodies import Bodies, Modules, nominal_centre_motion
 from hil.plant.build import make_thrusters
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.docked import DockedBodies
@@ -140,7 +140,7 @@ class World(DockedBodies):
         self.docks = Docks(vehicles, dock or DockSpec(), jam or JamRule(), seed)
         self.jet_strength = spec.jet_strength
         self._held = set()
-        self._broken: dict[tuple[int, int], tuple[str, float]] = {}
+        self._thruster_faults: dict[tuple[int, int], tuple[str, float]] = {}
         self.push = np.zeros((len(vehicles), 6))
         """(m, 6) external push on each module: wrench about its hull's centre, module frame, N and N m."""
         alone = [Place(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])) for _ in vehicles]
@@ -160,11 +160,11 @@ class World(DockedBodies):
     def set_command(self, module: int, u: Sequence[float] | np.ndarray) -> None:
         """Sets the commands (t,), -1 to 1, of one module's thrusters, held until the next call."""
         wanted = np.array(u, dtype=np.float64)
-        if self._broken:
-            wanted = self._as_broken(module, wanted)
+        if self._thruster_faults:
+            wanted = self._with_thruster_faults(module, wanted)
         arrays = self._thrusters
         thrusters_module.command(arrays.force_curve, arrays.constants, arrays.level, self._first[module], wanted)
-        for (m, t), (how, value) in self._broken.items():
+        for (m, t), (how, value) in self._thruster_faults.items():
             if m == module and how == "weak":
                 self._thrusters.level[self._first[m] + t, 0] *= value
 
@@ -175,20 +175,20 @@ class World(DockedBodies):
             how: dead; weak: `value` is the share of force left, with a slower propeller; reversed; stuck: at the command
                 `value`; fake_rpm: `value` is the share of force left, but the ESC reports the speed of a healthy thruster.
         """
-        self._broken[module, thruster] = (how, value)
+        self._thruster_faults[module, thruster] = (how, value)
         share = value if how == "fake_rpm" else 1.0
         self._thrusters.constants[self._first[module] + thruster, 0] = share * self._draws[module].gain[thruster]
 
-    def mend(self, module: int) -> None:
+    def clear_faults(self, module: int) -> None:
         """Ends all faults of a module: restores thrusters, battery and magnets to their initial parameters and removes the push."""
-        self._broken = {key: broken for key, broken in self._broken.items() if key[0] != module}
+        self._thruster_faults = {key: broken for key, broken in self._thruster_faults.items() if key[0] != module}
         self._thrusters.constants[self._first[module] : self._first[module + 1], 0] = self._draws[module].gain
         self._thrusters.supply[module, 1] = self.vehicles[module].supply.voltage_v
         self.push[module] = 0.0
-        self.docks.free(module)
+        self.docks.unstick_relays(module)
 
-    def _as_broken(self, module: int, wanted: np.ndarray) -> np.ndarray:
-        for (m, t), (how, value) in self._broken.items():
+    def _with_thruster_faults(self, module: int, wanted: np.ndarray) -> np.ndarray:
+        for (m, t), (how, value) in self._thruster_faults.items():
             if m == module and how in ("dead", "reversed", "stuck"):
                 wanted[t] = {"dead": 0.0, "reversed": -wanted[t], "stuck": value}[how]
         return wanted
@@ -231,41 +231,42 @@ class World(DockedBodies):
         self._escs.clear()
         self._external[:] = 0.0
         if len(self.vehicles) > 1 or any(self.push.ravel().tolist()):
-            self._touch()
+            self._update_external_wrenches()
         faces = self.docks.faces if len(self.bodies) > 1 else None
         arrays = (self._body_arrays, self._modules, faces, self._thrusters, self._water)
         advance(*arrays, self._external, steps, h, self._stage, self._thrust, self._seen)
 
-    def _touch(self) -> None:
+    def _update_external_wrenches(self) -> None:
         """Computes the wrenches of jets and external pushes on modules and bodies."""
-        self._hands[:] = 0.0
+        self._module_wrenches[:] = 0.0
         if len(self.vehicles) > 1 and self.jet_strength > 0.0:
             jet = (self.jet_strength, self.spec.jet_length_m, self.spec.jet_radius_m)
-            add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._hands)
+            add_jets(self._thrusters, self._body_arrays, self._modules, *jet, self._module_wrenches)
         for m in sorted(set(self.push.nonzero()[0].tolist())):
             force, moment = (self._modules.turn[m] @ part for part in np.split(self.push[m], 2))
             moment += np.cross(self._modules.position[m], force)
-            self._hands[m] += np.concatenate([force, moment])
-        np.add.at(self._external, self._modules.body, self._hands)
+            self._module_wrenches[m] += np.concatenate([force, moment])
+        np.add.at(self._external, self._modules.body, self._module_wrenches)
 
-    def terms(self) -> tuple[object, ...]:
+    def batch_key(self) -> tuple[object, ...]:
         """Returns the parameters that all worlds of one batch must share: water, tank, tick and sub-step.
 
         Raises DescriptionError for more than one module, a faulty thruster, an external push, a clamped body, or a coil that carries
         current: these need Python between the ticks.
         """
-        if len(self.vehicles) > 1 or self._broken:
+        if len(self.vehicles) > 1 or self._thruster_faults:
             raise DescriptionError(
-                f"plant: a batch is of lone modules that are whole; here are {len(self.vehicles)} modules, {len(self._broken)} faults"
+                "plant: a batch is of lone modules that are whole; "
+                f"here are {len(self.vehicles)} modules, {len(self._thruster_faults)} faults"
             )
         acts = {"a hand is on it": self.push.any(), "it is clamped": self._body_arrays.clamped.any(), "a coil is on": self.docks.busy}
         if found := [what for what, does in acts.items() if does]:
             raise DescriptionError(f"plant: a batch is of lone modules that nothing but thrusters and water moves; here {', '.join(found)}")
         return (self._water[1:], self.period_ns, self._step_ns)
 
-    def lend(self, ticks: int) -> Arrays:
-        """Lends the arrays of a single-module world to `hil.batch`, which has checked `terms` and advances them by `ticks`. Sets the clock
-        to the end of these ticks at once, so the truth must not be read before the batch has flown.
+    def lend_arrays(self, ticks: int) -> Arrays:
+        """Lends the arrays of a single-module world to `hil.batch`, which has checked `batch_key` and advances them by `ticks`. Sets the
+        clock to the end of these ticks at once, so the truth must not be read before the batch has flown.
         """
         self._truths.clear()
         self._escs.clear()
@@ -300,7 +301,7 @@ class World(DockedBodies):
         modules = self.bodies[body]
         x = self._body_arrays.state[body]
         seen = np.empty(6)
-        steered(x, self._centres[body], seen)
+        nominal_centre_motion(x, self._centres[body], seen)
         return BodyTruth(self.time_ns, modules, seen[:3], x[3:7].copy(), seen[3:], x[10:13].copy())
 
     def esc(self, module: int) -> np.ndarray:

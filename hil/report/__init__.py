@@ -225,8 +225,8 @@ def _table(result: Result) -> str:
 
 def _told(result: Result) -> str:
     """Why no tag was seen and the firmware's warnings, shown under the table; empty if there is neither."""
-    lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in result.told)
-    lacked = [f"<p>{html.escape(result.unseen)}</p>"] if result.unseen else []
+    lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in result.warnings)
+    lacked = [f"<p>{html.escape(result.no_tag_reason)}</p>"] if result.no_tag_reason else []
     return "\n".join([*lacked, *([f"<h3>Warnings of the firmware</h3>\n<ul>\n{lines}\n</ul>"] if lines else [])])
 
 

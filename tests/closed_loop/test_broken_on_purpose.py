@@ -120,7 +120,7 @@ def test_robot_that_no_camera_saw_is_said_to_lack_a_tag(
 @pytest.mark.slow
 def test_robot_that_is_seen_and_never_armed_lacks_no_tag(fly: Fly, deaf: Callable[..., None]) -> None:
     deaf(Action.ARM)
-    assert fly(shortened("hover", 1.0, settle_s=2.0)).unseen == ""
+    assert fly(shortened("hover", 1.0, settle_s=2.0)).no_tag_reason == ""
 
 
 @pytest.mark.slow

@@ -96,7 +96,7 @@ def broken(nodes: Nodes) -> list[object]:
         world.set_command(mcu.module, [0.5] * 8)
     levels = world._thrusters.level[:, 0].tolist(), world._thrusters.constants[:, 0].tolist()
     supply = world._thrusters.supply[:, 1].tolist()
-    told = [(m.frozen, m.leaks, m.unread) for m in mcus]
+    told = [(m.frozen, m.leaks, m.readings_absent) for m in mcus]
     return [*levels, supply, world.docks.relays.tolist(), world.push.tolist(), world.jet_strength, told]
 
 

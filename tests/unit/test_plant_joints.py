@@ -80,8 +80,8 @@ def test_jet_on_one_of_two_loads_their_joint_as_a_hand_would() -> None:
     world.set_command(2, 0.8 * along / np.abs(along).max())
     run(world, 0.2)
     world._step(0)
-    jet, load = world._hands[1].copy(), world._pull_on(world.docks.joints[0])
-    assert jet[0] < -0.01 and not world._hands[0].any()
+    jet, load = world._module_wrenches[1].copy(), world._pull_on(world.docks.joints[0])
+    assert jet[0] < -0.01 and not world._module_wrenches[0].any()
     world.jet_strength = 0.0
     world._step(0)
     assert abs(world._pull_on(world.docks.joints[0])) < 0.01 * abs(load)

@@ -20,7 +20,7 @@ from hil.checks import UNBOUNDED, Limit, Result, judge
 from hil.console import flight_progress, print_result
 from hil.flight import as_wanted, wanted_in
 from hil.force_metrics import force_names
-from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, told
+from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, warning_lines
 from hil.plots import (
     GREY,
     NOT_JUDGED,
@@ -337,16 +337,16 @@ def test_terminal_table_names_the_check_that_failed(result: Result) -> None:
 def test_table_and_report_say_what_the_firmware_warned_of(flight: Flight, result: Result, tmp_path: Path) -> None:
     texts = ["ARM refused: no pose yet", "armed", "ARM refused: no pose yet", *(f"thruster {i} <weak>" for i in range(7))]
     severity, times = np.array([4, 6, 4] + [3] * 7), START_NS + 500_000_000 * np.arange(2, 12)
-    lines = told({"severity": severity, "text": np.array(texts), "log_time": times}, START_NS)
+    lines = warning_lines({"severity": severity, "text": np.array(texts), "log_time": times}, START_NS)
     assert lines[:2] == ("1.0 s: ARM refused: no pose yet (2 x)", "2.5 s: thruster 0 <weak>") and len(lines) == 8
-    warned, console = result._replace(told=lines), Console(file=io.StringIO(), width=100)
+    warned, console = result._replace(warnings=lines), Console(file=io.StringIO(), width=100)
     print_result(warned, None, console)
     shown = console.file.getvalue()  # type: ignore[attr-defined]
     assert "warnings of the firmware:\n  1.0 s: ARM refused: no pose yet (2 x)\n" in shown
     assert "thruster 4" in shown and "thruster 5" not in shown and "and 2 more" in shown
     page = write_report(tmp_path, warned, flight, scene(), []).read_text()
     assert "<li>5.5 s: thruster 6 &lt;weak&gt;</li>" in page
-    assert "<p>no tag &lt;5&gt;</p>" in write_report(tmp_path, result._replace(unseen="no tag <5>"), flight, scene(), []).read_text()
+    assert "<p>no tag &lt;5&gt;</p>" in write_report(tmp_path, result._replace(no_tag_reason="no tag <5>"), flight, scene(), []).read_text()
     assert "Warnings of the firmware</h3>" not in write_report(tmp_path, result, flight, scene(), []).read_text()
 
 

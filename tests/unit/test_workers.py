@@ -10,7 +10,7 @@ import pytest
 
 import hil.campaign
 from firmware_py.description.schema import DescriptionError
-from hil.workers import Pool, dask_cluster, kept
+from hil.workers import Pool, dask_cluster, reused
 from tests.unit.campaigns import Inline, PlugError, content, fly, flying
 
 
@@ -89,7 +89,7 @@ def test_seeds_that_kill_their_workers_are_named_when_all_others_are_flown(
 def test_few_trials_are_under_way_after_a_death(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     flown, under_way = flying(monkeypatch), []
     executors = iter([dying(after=0)(), Inline()])
-    monkeypatch.setattr(hil.campaign, "FEW", 4)
+    monkeypatch.setattr(hil.campaign, "TRIALS_AFTER_A_DEATH", 4)
     fly(tmp_path, range(20), lambda: next(executors), progress=lambda done, total: under_way.append(len(flown) - done + 1))
     assert max(under_way) == 4
 
@@ -145,7 +145,7 @@ def test_workers_that_are_kept_serve_every_campaign_until_one_dies(tmp_path: Pat
         return dying(after=3)() if len(made) == 1 else Inline()
 
     flying(monkeypatch)
-    with kept(pool) as workers:
+    with reused(pool) as workers:
         fly(tmp_path / "first", range(2), workers)
         assert made == [0]
         fly(tmp_path / "second", range(2), workers)
