@@ -18,19 +18,19 @@ from typing import Annotated, Any
 from command_line import run_tool
 
 import typer
-from accept_figures import Figure, Group, said
+from accept_figures import Figure, Group, reported_by_test
 from accept_ground import GROUND
 from accept_measures import (
     Values,
+    campaign_of,
     characterised,
-    flown,
+    identified_plants,
     loop_margins,
-    passed_by,
+    near_miss_passes,
     repeated,
     said_by_tests,
     saved_by_least_power,
     timed,
-    told_from_logs,
 )
 from accept_safety import SAFETY
 from accept_tuning import TUNING
@@ -136,19 +136,19 @@ def strip(modules: int, sensors: str) -> Group:
     )
     scenario = f"mobius-{modules}"
     command = f"modcube hil campaign {scenario} --trials 10 --jobs 2{' --sensors ideal' if ideal else ''}"
-    return Group(f"{scenario}-ideal" if ideal else scenario, 4, command, flown(scenario, trials=10, sensors=sensors), figures)
+    return Group(f"{scenario}-ideal" if ideal else scenario, 4, command, campaign_of(scenario, trials=10, sensors=sensors), figures)
 
 
 GROUPS: tuple[Group, ...] = (
     Group(
-        "hover", 2, "modcube hil campaign hover --trials 20 --jobs 2", flown("hover"),
+        "hover", 2, "modcube hil campaign hover --trials 20 --jobs 2", campaign_of("hover"),
         (
             Figure("hover, 20 seeds: position RMSE, worst", "position_rmse_m.max", high=5.0, unit="mm", scale=MM),
             Figure("hover, 20 seeds: share that passed its checks", "passed", low=1.0),
         ),
     ),
     Group(
-        "spiral", 2, "modcube hil campaign spiral --trials 20 --jobs 2", flown("spiral"),
+        "spiral", 2, "modcube hil campaign spiral --trials 20 --jobs 2", campaign_of("spiral"),
         (
             Figure("spiral, 20 seeds: position RMSE, median", "position_rmse_m.median", high=5.0, unit="mm", scale=MM),
             Figure("spiral, 20 seeds: position RMSE, worst", "position_rmse_m.max", high=8.0, unit="mm", scale=MM),
@@ -159,7 +159,7 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "paper", 2, "modcube hil campaign spiral --trials 20 --jobs 2 --controller paper", flown("spiral", "paper"),
+        "paper", 2, "modcube hil campaign spiral --trials 20 --jobs 2 --controller paper", campaign_of("spiral", "paper"),
         (
             Figure(
                 "paper's controller, same 20 seeds: position RMSE, median (paper's tank: 20.92 mm)",
@@ -192,7 +192,7 @@ GROUPS: tuple[Group, ...] = (
     ),
     *(strip(modules, sensors) for modules in (1, 2, 4) for sensors in ("ideal", "real")),
     Group(
-        "polycube", 4, "modcube hil campaign polycube --trials 20 --jobs 2", flown("polycube"),
+        "polycube", 4, "modcube hil campaign polycube --trials 20 --jobs 2", campaign_of("polycube"),
         (
             Figure(
                 "random polycubes of 2 to 8 modules, 20: position RMSE, worst", "position_rmse_m.max", high=15.0, unit="mm", scale=MM
@@ -200,7 +200,7 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "dock", 5, "modcube hil campaign dock --trials 1000 --jobs 2", flown("dock", trials=1000),
+        "dock", 5, "modcube hil campaign dock --trials 1000 --jobs 2", campaign_of("dock", trials=1000),
         (
             Figure("dock, 1000 trials: lower 95 % bound of success", "passed.low", low=98.0, unit="%", scale=100.0),
             Figure("dock: step of a thruster's command when bodies join, worst", "join_jump_n.max", high=1.0, unit="N"),
@@ -208,25 +208,25 @@ GROUPS: tuple[Group, ...] = (
     ),
     Group(
         "dock-paper", 5, "modcube hil campaign dock --trials 200 --jobs 2 --controller paper_sequence",
-        flown("dock", "paper_sequence", 200),
+        campaign_of("dock", "paper_sequence", 200),
         (
             Figure("dock, the paper's sequence, 200 trials: docked", "passed", low=60.0, high=97.0, unit="%", scale=100.0),
             Figure("the same: of the failures, jams", "failed.jammed", low=50.0, unit="%", scale=100.0),
         ),
     ),
     Group(
-        "dock-paper-whole", 5, "modcube hil campaign dock --trials 200 --jobs 2 --controller paper", flown("dock", "paper", 200),
+        "dock-paper-whole", 5, "modcube hil campaign dock --trials 200 --jobs 2 --controller paper", campaign_of("dock", "paper", 200),
         (
             Figure("dock, the paper's sequence, controller and filter, 200 trials: docked", "passed", low=0.0, unit="%", scale=100.0),
             Figure("the same: of the failures, jams", "failed.jammed", low=50.0, unit="%", scale=100.0),
         ),
     ),
     Group(
-        "dock-near-miss", 5, "modcube hil campaign dock-near-miss --trials 300 --jobs 2", flown("dock-near-miss", trials=300),
+        "dock-near-miss", 5, "modcube hil campaign dock-near-miss --trials 300 --jobs 2", campaign_of("dock-near-miss", trials=300),
         (Figure("near miss, 300 flown: docks declared that were none", "false_declarations.max", high=0.0),),
     ),
     Group(
-        "near-miss-passes", 5, "make accept ONLY=near-miss-passes", passed_by,
+        "near-miss-passes", 5, "make accept ONLY=near-miss-passes", near_miss_passes,
         (
             Figure("near miss, 10,000 passes through real frames: docks declared", "declared", high=0.0),
             Figure("the same, by the current alone", "current", low=1.0),
@@ -234,20 +234,20 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "dock-third", 5, "modcube hil campaign dock-third --trials 100 --jobs 2", flown("dock-third", trials=100),
+        "dock-third", 5, "modcube hil campaign dock-third --trials 100 --jobs 2", campaign_of("dock-third", trials=100),
         (Figure("a third module joins a pair, 100 trials: docked", "passed", low=95.0, unit="%", scale=100.0),),
     ),
     Group(
-        "dock-vertical", 5, "modcube hil campaign dock-vertical --trials 100 --jobs 2", flown("dock-vertical", trials=100),
+        "dock-vertical", 5, "modcube hil campaign dock-vertical --trials 100 --jobs 2", campaign_of("dock-vertical", trials=100),
         (Figure("one above the other, second tag source, 100 trials: docked", "passed", low=95.0, unit="%", scale=100.0),),
     ),
     Group(
         "dock-vertical-blind", 5, "modcube hil campaign dock-vertical-blind --trials 100 --jobs 2",
-        flown("dock-vertical-blind", trials=100),
+        campaign_of("dock-vertical-blind", trials=100),
         (Figure("the same without the second tag source, 100 trials: refused, nothing touched", "passed", low=1.0),),
     ),
     Group(
-        "dock-mobius", 5, "modcube hil campaign dock-mobius --trials 10 --jobs 2", flown("dock-mobius", trials=10),
+        "dock-mobius", 5, "modcube hil campaign dock-mobius --trials 10 --jobs 2", campaign_of("dock-mobius", trials=10),
         (
             Figure("dock, Moebius strip as one, undock, 10 trials: passed", "passed", low=1.0),
             Figure("joined pair on the strip: position RMSE, worst", "docked_rmse_m.max", high=7.0, unit="mm", scale=MM),
@@ -263,7 +263,7 @@ GROUPS: tuple[Group, ...] = (
         ),
     ),
     Group(
-        "identify", 9, "python tools/identify_plants.py --plants 10 --jobs 2", told_from_logs,
+        "identify", 9, "python tools/identify_plants.py --plants 10 --jobs 2", identified_plants,
         (
             Figure("10 plants told from 3-minute logs, load cell +-2 %: total mass, worst error", "mass", high=10.0, unit="%", scale=100.0),
             Figure("the same: drag coefficients, worst error", "drag", high=10.0, unit="%", scale=100.0),
@@ -275,10 +275,10 @@ GROUPS: tuple[Group, ...] = (
     Group(
         "vcan", 3, "MODCUBE_FULL=1 pytest -s tests/vcan/test_in_guest.py", said_by_tests("tests/vcan/test_in_guest.py"),
         (
-            said("spiral in lockstep over vcan0: lines of can.log that differ from virtual", high=0.0),
-            said("log played back by canplayer: frames that decode to the same messages", low=50_000.0),
-            said("lockstep over vcan, link events, sum", low=1000.0),
-            said("lockstep over vcan, link events: resumed within", high=0.5, unit="s"),
+            reported_by_test("spiral in lockstep over vcan0: lines of can.log that differ from virtual", high=0.0),
+            reported_by_test("log played back by canplayer: frames that decode to the same messages", low=50_000.0),
+            reported_by_test("lockstep over vcan, link events, sum", low=1000.0),
+            reported_by_test("lockstep over vcan, link events: resumed within", high=0.5, unit="s"),
             Figure("tests on vcan0 in lockstep that failed", "failed", high=0.0),
         ),
     ),
@@ -286,12 +286,12 @@ GROUPS: tuple[Group, ...] = (
         "vcan-real-time", 3, "MODCUBE_FULL=1 pytest -s tests/vcan/test_realtime_in_guest.py",
         said_by_tests("tests/vcan/test_realtime_in_guest.py"),
         (
-            *(said(f"real time on vcan0, {name}: p99 lateness", high=100.0, unit="us") for name in ON_TIME),
-            *(said(f"real time on vcan0, {name}: overruns", high=0.0) for name in ON_TIME),
-            said("real time on vcan0, in a flood of cangen: position RMSE", high=8.0, unit="mm"),
-            said("real time on vcan0, link events, sum", low=1000.0),
-            said("real time on vcan0, link events: resumed within", high=0.5, unit="s"),
-            said("real time on vcan0, C node: position RMSE", high=8.0, unit="mm"),
+            *(reported_by_test(f"real time on vcan0, {name}: p99 lateness", high=100.0, unit="us") for name in ON_TIME),
+            *(reported_by_test(f"real time on vcan0, {name}: overruns", high=0.0) for name in ON_TIME),
+            reported_by_test("real time on vcan0, in a flood of cangen: position RMSE", high=8.0, unit="mm"),
+            reported_by_test("real time on vcan0, link events, sum", low=1000.0),
+            reported_by_test("real time on vcan0, link events: resumed within", high=0.5, unit="s"),
+            reported_by_test("real time on vcan0, C node: position RMSE", high=8.0, unit="mm"),
             Figure("tests on vcan0 in real time that failed", "failed", high=0.0),
         ),
     ),
@@ -308,18 +308,18 @@ GROUPS: tuple[Group, ...] = (
         "vehicle-process", 8, "MODCUBE_FULL=1 pytest -s tests/closed_loop/test_vehicle_process.py",
         said_by_tests("tests/closed_loop/test_vehicle_process.py"),
         (
-            said("vehicle's process, warm cache: armed and holding after", high=3.0, unit="s"),
-            said("vehicle's process, killed: armed and holding again after", high=4.0, unit="s"),
-            said("vehicle's process: peak of memory", high=250.0, unit="MB"),
+            reported_by_test("vehicle's process, warm cache: armed and holding after", high=3.0, unit="s"),
+            reported_by_test("vehicle's process, killed: armed and holding again after", high=4.0, unit="s"),
+            reported_by_test("vehicle's process: peak of memory", high=250.0, unit="MB"),
             Figure("tests on the vehicle's process that failed", "failed", high=0.0),
         ),
     ),
     Group(
         "flash", 8, "make test-flash", said_by_tests("tests/jetson"),
         (
-            said("flashed Debian machine: modules that answer its service", low=1.0, high=1.0),
-            said("flashed Debian machine: releases rolled back by itself", low=1.0, high=1.0),
-            said("flashed Debian machine: power cuts survived", low=1.0, high=1.0),
+            reported_by_test("flashed Debian machine: modules that answer its service", low=1.0, high=1.0),
+            reported_by_test("flashed Debian machine: releases rolled back by itself", low=1.0, high=1.0),
+            reported_by_test("flashed Debian machine: power cuts survived", low=1.0, high=1.0),
             Figure("tests on a flashed Debian machine that failed", "failed", high=0.0),
         ),
     ),

@@ -34,6 +34,6 @@ class Group:
     figures: tuple[Figure, ...]
 
 
-def said(name: str, low: float = -UNBOUNDED, high: float = UNBOUNDED, unit: str = "") -> Figure:
+def reported_by_test(name: str, low: float = -UNBOUNDED, high: float = UNBOUNDED, unit: str = "") -> Figure:
     """A figure that a test reports by name."""
     return Figure(name, name, low, high, unit)

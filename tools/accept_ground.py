@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from accept_figures import Figure, Group, said
+from accept_figures import Figure, Group, reported_by_test
 from accept_measures import printed_by, said_by_tests
 
 PACKETS, CLIENTS = "tests/unit/test_ground_attack.py", "tests/clients"
@@ -19,16 +19,16 @@ GROUND: tuple[Group, ...] = (
     Group(
         "packets", 6, f"MODCUBE_FULL=1 pytest -s {PACKETS}", said_by_tests(PACKETS),
         (
-            said("random and mutated packets without exception or a change that no valid sender could cause", low=1_000_000.0),
-            said("packets forged or replayed on a keyed link, the real station in control after them", low=100_000.0),
-            said("packets forged or replayed: believed", high=0.0),
+            reported_by_test("random and mutated packets without exception or a change that no valid sender could cause", low=1_000_000.0),
+            reported_by_test("packets forged or replayed on a keyed link, the real station in control after them", low=100_000.0),
+            reported_by_test("packets forged or replayed: believed", high=0.0),
             Figure("tests of packets that failed", "failed", high=0.0),
         ),
     ),
     Group(
         "clients", 6, f"pytest -s -m clients {CLIENTS}", said_by_tests("-m", "clients", CLIENTS),
         (
-            said("mission of 8 waypoints by MAVSDK: position RMSE", high=10.0, unit="mm"),
+            reported_by_test("mission of 8 waypoints by MAVSDK: position RMSE", high=10.0, unit="mm"),
             Figure("tests with MAVSDK and MAVProxy that failed", "failed", high=0.0),
         ),
     ),

@@ -35,7 +35,7 @@ FIGURE = re.compile(r"^figure: (?P<name>.+) = (?P<value>\S+)", re.MULTILINE)
 Values = Mapping[str, float]
 
 
-def flown(scenario: str, controller: str = "modcube", trials: int = 20, sensors: str = "real") -> Callable[[Path], Values]:
+def campaign_of(scenario: str, controller: str = "modcube", trials: int = 20, sensors: str = "real") -> Callable[[Path], Values]:
     """Flies `trials` seeds of a scenario.
 
     Keys are `metric.quantile`; `passed`, the share of flights that passed every check; `passed.low`, its lower 95 % bound; and
@@ -93,12 +93,12 @@ def characterised(folder: Path) -> Values:
     return took
 
 
-def told_from_logs(folder: Path) -> Values:
+def identified_plants(folder: Path) -> Values:
     """Identifies ten robots that differ from their vehicle file, each from a three-minute log with a load cell within 2 %."""
     return identify_plants.examine_all(range(PLANTS), JOBS, folder)
 
 
-def passed_by(folder: Path) -> Values:
+def near_miss_passes(folder: Path) -> Values:
     """Counts the docks that the docking detector declares in ten thousand near misses, seen through real frames."""
     chunks = [range(first, first + CHUNK) for first in range(0, PASSES, CHUNK)]
     total: dict[str, int] = {}

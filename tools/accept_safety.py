@@ -48,7 +48,7 @@ OPERATED_S = 30.0
 """Length of each flight with a random operator."""
 LOGGED_S = 600.0
 """Length of the log to replay."""
-MOST_SIGMAS, SQUARES = 4.0, (0.5, 2.0)
+MOST_SIGMAS, MEAN_SQUARE_LIMITS = 4.0, (0.5, 2.0)
 """Limits on the normalised errors. Of 100 standard normal numbers, the largest exceeds 4 in one set of 160, and their mean square lies
 outside 0.7 to 1.3 in one set of 30, so a factor of two is no coincidence.
 """
@@ -202,7 +202,7 @@ SAFETY: tuple[Group, ...] = (
             Figure("the same: RMSE over the five seconds, median", "rmse_median", unit="mm", scale=1e3),
             Figure("the same: RMSE, 95 %", "rmse_p95", unit="mm", scale=1e3),
             Figure("the same: error of the estimate, worst, in its own sigmas", "sigmas", high=MOST_SIGMAS),
-            Figure("the same: mean square of them (1: consistent)", "square", low=SQUARES[0], high=SQUARES[1]),
+            Figure("the same: mean square of them (1: consistent)", "square", low=MEAN_SQUARE_LIMITS[0], high=MEAN_SQUARE_LIMITS[1]),
         ),
     ),
     Group(

@@ -25,16 +25,16 @@ from hil.plant.spec import SensorSpec, WorldSpec
 from hil.safety import ICM_20602, Imu
 from hil.scenario import load_scenario
 
-PLACE, SPEED, WATER, TENDS, TILT, RATE, MOMENT, STEADY, GYRO_BIAS, ACCEL_BIAS, PUSH = range(11)
+PLACE, SPEED, WATER, GUST_TARGET, TILT, RATE, MOMENT, STEADY, GYRO_BIAS, ACCEL_BIAS, PUSH = range(11)
 STATES = 11
 """Number of states of one axis: place, m; speed, m/s; velocity of the water and the velocity that its gust tends to, m/s; tilt, rad; rate,
 rad/s; transient and steady moment, N m; gyro bias, rad/s; accelerometer bias, m/s^2; steady push, m/s^2.
 """
 PERIOD_S = 0.01
 HOVERS = 4000
-PUSHED, TWISTED = 0.1, 0.1
+INITIAL_PUSH_SIGMA, INITIAL_MOMENT_SIGMA = 0.1, 0.1
 """Sigma of the steady push, m/s^2, and of the steady moment, N m, before the first tag: more than buoyancy, current and trim produce."""
-TILTED, TURNED, MOVED = 0.05, 0.05, 0.02
+INITIAL_TILT_SIGMA, INITIAL_RATE_SIGMA, INITIAL_PLACE_SIGMA = 0.05, 0.05, 0.02
 """Sigma of tilt, rad, rate, rad/s, and place, m, before the first tag."""
 MOMENT_S = 1.0
 """Correlation time of the unforeseen moment: that of the gusts which the thrusters counteract (`gust_smoothing_s`)."""
@@ -74,23 +74,26 @@ def model(world: WorldSpec, sensors: SensorSpec, vehicle: Vehicle, unforeseen_n_
     upright = world.gravity * vehicle.inertial.wet_kg * vehicle.inertial.righting_arm_m
     rates = np.zeros((STATES, STATES))
     rates[PLACE, SPEED] = 1.0
-    rates[WATER, [WATER, TENDS]] = -1.0 / t2, 1.0 / t2
+    rates[WATER, [WATER, GUST_TARGET]] = -1.0 / t2, 1.0 / t2
     rates[SPEED] = rates[WATER]
     rates[SPEED, [SPEED, WATER, PUSH]] += -pull, pull, 1.0
-    rates[TENDS, TENDS] = -1.0 / t1
+    rates[GUST_TARGET, GUST_TARGET] = -1.0 / t1
     rates[TILT, RATE] = 1.0
     rates[RATE, [TILT, MOMENT, STEADY]] = np.array([-upright, 1.0, 1.0]) / inertia
     rates[RATE] += rates[RATE, TILT] / world.gravity * rates[WATER]
     rates[MOMENT, MOMENT] = -1.0 / MOMENT_S
     noise = np.zeros(STATES)
-    noise[TENDS] = tends**2 * (1.0 - math.exp(-2.0 * PERIOD_S / t1))
+    noise[GUST_TARGET] = tends**2 * (1.0 - math.exp(-2.0 * PERIOD_S / t1))
     noise[MOMENT] = unforeseen_n_m**2 * (1.0 - math.exp(-2.0 * PERIOD_S / MOMENT_S))
     noise[GYRO_BIAS], noise[ACCEL_BIAS] = sensors.gyro_walk**2 * PERIOD_S, sensors.accel_walk**2 * PERIOD_S
     felt, turning = rates[SPEED].copy(), np.zeros(STATES)
     felt[TILT], felt[ACCEL_BIAS] = world.gravity, 1.0
     turning[RATE] = turning[GYRO_BIAS] = 1.0
     water, biases = [world.current_m_s, world.gust_m_s, tends], [sensors.gyro_bias, sensors.accel_bias]
-    start = np.array([MOVED, *water, TILTED, TURNED, unforeseen_n_m, TWISTED, *biases, PUSHED]) ** 2
+    start = np.array([
+        INITIAL_PLACE_SIGMA, *water, INITIAL_TILT_SIGMA, INITIAL_RATE_SIGMA, unforeseen_n_m, INITIAL_MOMENT_SIGMA, *biases,
+        INITIAL_PUSH_SIGMA,
+    ]) ** 2  # fmt: skip
     return Model(expm(PERIOD_S * rates), noise, ((felt, sensors.accel_sigma**2), (turning, sensors.gyro_sigma**2)), start)
 
 

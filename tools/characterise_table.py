@@ -189,7 +189,7 @@ def read_paper(path: Path) -> dict[tuple[str, str, str], dict[str, float]]:
         }
 
 
-def word(row: Row, column: str, paper: Mapping[str, float], columns: Sequence[str]) -> str:
+def verdict(row: Row, column: str, paper: Mapping[str, float], columns: Sequence[str]) -> str:
     """Verdict on one cell beside the paper's."""
     ours, theirs = row.cells[column], paper[column]
     metric = row.metric

@@ -68,7 +68,7 @@ def show(
     shown.add_column("Spearman (n)", justify="right")
     for row in rows:
         if row.key in paper:
-            words = {name: table.word(row, name, paper[row.key], columns) for name in columns}
+            words = {name: table.verdict(row, name, paper[row.key], columns) for name in columns}
             cells = [_cell(table.text(row.cells[n]), f"{paper[row.key][n]:.4g}", words[n]) for n in columns]
             rho, count = table.spearman({n: row.cells[n] for n in columns}, paper[row.key])
             shown.add_row(_label(row), *cells, f"{rho:.2f} ({count})" if np.isfinite(rho) else "-")

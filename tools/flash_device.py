@@ -56,9 +56,9 @@ COMPILERS = ("numba", "llvmlite", "numpy")
 """Distributions on which compiled code depends besides its sources."""
 STATUS_FIELDS = ("ActiveState", "SubState", "MainPID", "NRestarts", "StatusText")
 COMMANDS = ("missing", "install", "activate", "rollback", "boot", "status")
-LOOKING = ("boot", "status")
+LOCK_FREE_COMMANDS = ("boot", "status")
 """Commands that take no input, and never wait for another flash."""
-DISTURBING = ("missing", "activate", "rollback")
+REFUSED_WHILE_ARMED = ("missing", "activate", "rollback")
 """Commands refused while armed: those that stop the service, and the first step of a flash, which ends in that."""
 
 
@@ -147,7 +147,7 @@ class Device:
         if old is None:
             return
         before = json.loads((self.releases / old / "release.json").read_text())["wheels"]
-        if all(made_by(before, name) == made_by(wheels, name) for name in COMPILERS):
+        if all(wheel_of_distribution(before, name) == wheel_of_distribution(wheels, name) for name in COMPILERS):
             source = next((self.releases / old / "lib").glob("python*/site-packages"))
             if source.parent.name == packages.parent.name:
                 carry_compiled(source, packages)
@@ -161,7 +161,7 @@ class Device:
         target = self.releases / release
         if not (target / "release.json").is_file():
             raise RefusedError(f"there is no release {release}; there are {', '.join(self.names()) or 'none'}")
-        self._settle()
+        self._roll_back_unwatched_trial()
         self._install_units(guard_unit(self.root), GUARD)
         units = release_units(target, self.root)
         old = None if self.trial.exists() else self.linked(self.current)  # never one that is still on trial
@@ -188,7 +188,7 @@ class Device:
     def roll_back(self) -> str:
         """Activates the previous release; returns its name. Raises RefusedError."""
         tried = self.linked(self.current)
-        self._settle()
+        self._roll_back_unwatched_trial()
         now, earlier = self.linked(self.current), self.linked(self.previous)
         if now is not None and now != tried:  # the current one was still on trial and is rolled back already
             self._start_and_wait(now)
@@ -203,7 +203,7 @@ class Device:
         trial = self._on_trial()
         if trial is None or watches(trial):
             return ""
-        said = self._settle()
+        said = self._roll_back_unwatched_trial()
         if said:
             with contextlib.suppress(RefusedError):  # needed if systemd refused the unit on trial: then nothing else starts the service
                 self._run([*as_root(), "systemctl", "--no-block", "restart", SERVICE])
@@ -219,7 +219,7 @@ class Device:
             return {}
         return trial if isinstance(trial, dict) else {}
 
-    def _settle(self) -> str:
+    def _roll_back_unwatched_trial(self) -> str:
         """Rolls back a trial without a watcher; returns what it did. Called with the lock held, or once the watcher is known to be gone.
 
         A vehicle's first release has none to go back to: it keeps running, and stays on trial until the next flash.
@@ -391,7 +391,7 @@ def in_flight(status: dict[str, str]) -> str:
     return f"{what}, and its service would be stopped: disarm it, or say --armed"
 
 
-def made_by(wheels: dict[str, str], name: str) -> str:
+def wheel_of_distribution(wheels: dict[str, str], name: str) -> str:
     """The file name of a distribution's wheel; empty where there is none."""
     return next((wheel for wheel in wheels if wheel.startswith(f"{name}-")), "")
 
@@ -414,10 +414,10 @@ def main(words: Sequence[str] | None = None) -> int:
     signal.signal(signal.SIGHUP, signal.SIG_IGN)
     asked = parse(words)
     device, command = Device(asked.root, run), asked.command
-    given = {} if command in LOOKING else json.loads(sys.stdin.read() or "{}")
+    given = {} if command in LOCK_FREE_COMMANDS else json.loads(sys.stdin.read() or "{}")
     device.root.mkdir(parents=True, exist_ok=True)
     try:
-        with alone(device.root, command):
+        with flash_lock(device.root, command):
             answer = {"result": perform(device, command, given)}
     except (RefusedError, OSError) as error:
         answer = {"error": str(error), "untouched": isinstance(error, UntouchedError)}
@@ -430,7 +430,7 @@ def main(words: Sequence[str] | None = None) -> int:
 
 def perform(device: Device, command: str, given: dict[str, Any]) -> object:
     """Runs one command. Raises RefusedError."""
-    if command in DISTURBING and not given.get("armed"):
+    if command in REFUSED_WHILE_ARMED and not given.get("armed"):
         device.check_disarmed()
     if command == "missing":
         return device.missing_wheels(given["wheels"])
@@ -446,9 +446,9 @@ def perform(device: Device, command: str, given: dict[str, Any]) -> object:
 
 
 @contextlib.contextmanager
-def alone(root: Path, command: str) -> Iterator[None]:
-    """Holds the lock of a flash; a second flash is refused. Commands in LOOKING, such as the one at service start, take no lock."""
-    if command in LOOKING:
+def flash_lock(root: Path, command: str) -> Iterator[None]:
+    """Holds the lock of a flash; a second flash is refused. LOCK_FREE_COMMANDS, such as the one at service start, take no lock."""
+    if command in LOCK_FREE_COMMANDS:
         yield
         return
     with (root / "lock").open("w") as lock:

@@ -57,13 +57,13 @@ def make_payload(machine: str, python: str, cache: Path, offline: bool) -> Paylo
     Raises:
         PayloadError: the wheel does not build, or a wheel is missing.
     """
-    house = cache / f"{machine}-cp{python.replace('.', '')}"
-    house.mkdir(parents=True, exist_ok=True)
+    wheel_dir = cache / f"{machine}-cp{python.replace('.', '')}"
+    wheel_dir.mkdir(parents=True, exist_ok=True)
     blocks = locked(ROOT / "requirements.lock")
     text = "\n".join(blocks[name] for name in sorted(runtime_names() & set(blocks)))
-    fetch(text, house, machine, python, offline)
+    fetch(text, wheel_dir, machine, python, offline)
     own = build_wheel(cache)
-    wheels = (own, *sorted(wheels_of(text, house)))
+    wheels = (own, *sorted(wheels_of(text, wheel_dir)))
     return Payload(release_name(own, text), wheels)
 
 
@@ -134,21 +134,21 @@ def platforms(machine: str) -> list[str]:
     return [*tags, f"manylinux2014_{machine}", f"linux_{machine}"]  # 2014: alias of 2_17
 
 
-def fetch(lock: str, house: Path, machine: str, python: str, offline: bool) -> None:
-    """Downloads the locked wheels that are missing in `house`. Raises PayloadError."""
-    missing = [line for line in pins(lock) if not wheel_of(*line, house)]
+def fetch(lock: str, wheel_dir: Path, machine: str, python: str, offline: bool) -> None:
+    """Downloads the locked wheels that are missing in `wheel_dir`. Raises PayloadError."""
+    missing = [line for line in pins(lock) if not wheel_of(*line, wheel_dir)]
     if not missing:
         return
     if offline:
         name, version = missing[0]
         more = f" and {len(missing) - 1} more" if len(missing) > 1 else ""
-        raise PayloadError(f"no wheel of {name} {version}{more} in {house}: run once without --offline")
+        raise PayloadError(f"no wheel of {name} {version}{more} in {wheel_dir}: run once without --offline")
     with tempfile.NamedTemporaryFile("w", suffix=".lock") as file:
         file.write(lock)
         file.flush()
         choice = [word for tag in platforms(machine) for word in ("--platform", tag)]
         pip(
-            "download", "--no-deps", "--require-hashes", "--only-binary=:all:", "--dest", str(house),
+            "download", "--no-deps", "--require-hashes", "--only-binary=:all:", "--dest", str(wheel_dir),
             "--implementation", "cp", "--python-version", python, *choice, "--requirement", file.name,
         )  # fmt: skip
 
@@ -166,17 +166,17 @@ def pins(lock: str) -> list[tuple[str, str]]:
     return found
 
 
-def wheel_of(name: str, version: str, house: Path) -> Path | None:
+def wheel_of(name: str, version: str, wheel_dir: Path) -> Path | None:
     """Wheel of one pin; None if it is missing."""
-    for path in house.glob("*.whl"):
+    for path in wheel_dir.glob("*.whl"):
         if (canonicalize_name(path.name.split("-")[0]), path.name.split("-")[1]) == (name, version):
             return path
     return None
 
 
-def wheels_of(lock: str, house: Path) -> list[Path]:
+def wheels_of(lock: str, wheel_dir: Path) -> list[Path]:
     """Wheels of all pins that are present."""
-    return [path for pin in pins(lock) if (path := wheel_of(*pin, house)) is not None]
+    return [path for pin in pins(lock) if (path := wheel_of(*pin, wheel_dir)) is not None]
 
 
 def pip(*words: str) -> None:

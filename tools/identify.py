@@ -158,10 +158,10 @@ def identify(given: argparse.Namespace) -> int:
         flights = [Equations(recording, smooth(recording), curve, weight) for recording in recordings]
         if weight is not None:
             check_hung(weight, flights[0])
-        return leave(given, fit(flights, reference, weight is not None), recordings[0], curve)
+        return write_and_report(given, fit(flights, reference, weight is not None), recordings[0], curve)
 
 
-def leave(given: argparse.Namespace, result: Fit, recording: Recording, curve: ThrusterCurve) -> int:
+def write_and_report(given: argparse.Namespace, result: Fit, recording: Recording, curve: ThrusterCurve) -> int:
     """Prints and writes the result of the fit with `curve`; returns the exit status. Raises OSError."""
     vehicle = recording.vehicle
     found, logs = findings(result, vehicle), ", ".join(given.logs)

@@ -13,14 +13,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from identify_model import NUISANCES, Equations, Unknown, beginning, gust_precision, places, unknowns
+from identify_model import NUISANCES, Equations, Unknown, gust_precision, initial_values, slices_by_name, unknowns
 
 MEMORY_S = 10.0
 """Time over which errors are assumed to be correlated."""
 GUST_M_S = 0.02
 """Initial value of the standard deviation of gusts."""
 MOST_STEPS = 15
-STILL = 0.05
+STEP_TOLERANCE = 0.05
 """Largest step, in standard errors, at which the search ends."""
 CERTAIN = 1e-6
 """Standard deviation of the prior that fixes a scale which nothing measures."""
@@ -44,14 +44,14 @@ class Fit:
     """Result of a fit.
 
     Attributes:
-        x: (p,) unknowns of the vehicle. places: slice of each in x, by name.
+        x: (p,) unknowns of the vehicle. slices: slice of each in x, by name.
         covariance: (p, p). critical: half-width of a 95 % interval in standard errors.
         residual: (6,) standard deviation of the residuals, m/s^2 and rad/s^2. gust_m_s: that of the gusts.
         has_scale: whether any absolute reference was known; otherwise gains are scaled to a mean of 1.
     """
 
     x: np.ndarray
-    places: dict[str, slice]
+    slices: dict[str, slice]
     covariance: np.ndarray
     critical: float
     residual: np.ndarray
@@ -60,7 +60,7 @@ class Fit:
 
     def value(self, name: str) -> np.ndarray:
         """Value of one unknown."""
-        return self.x[self.places[name]]
+        return self.x[self.slices[name]]
 
     def interval(self, function: Callable[[np.ndarray], float]) -> tuple[float, float]:
         """Value of a function of the unknowns, and the half-width of its 95 % interval, to first order."""
@@ -78,13 +78,13 @@ def fit(flights: Sequence[Equations], reference: Reference | None = None, has_we
     """Fits all flights of one vehicle at once; without `reference` and weight the mean gain is defined as 1."""
     vehicle = flights[0].vehicle
     mine = unknowns(len(vehicle.thruster))
-    shared, count = places(mine), sum(u.size for u in mine)
+    shared, count = slices_by_name(mine), sum(u.size for u in mine)
     parts, own = _with_nuisances(mine, flights)
     gusts = [np.kron(gust_precision(flight.knots.shape[1]), np.eye(3)) for flight in flights]
     width = np.concatenate([np.full(u.size, u.width) for u in parts])
     step = np.concatenate([np.full(u.size, u.step) for u in parts])
     first = np.zeros(len(width))
-    first[:count] = np.concatenate(list(beginning(vehicle).values()))
+    first[:count] = np.concatenate(list(initial_values(vehicle).values()))
     scale, pull = _scale_row(shared["gain"], len(first), reference, has_weight)
     prior = np.diag(width**-2.0) + pull * np.outer(scale, scale)  # about `first`, whose gains of 1 satisfy the scale row
     x, noise, gust = first.copy(), np.zeros(6), GUST_M_S
@@ -103,7 +103,7 @@ def fit(flights: Sequence[Equations], reference: Reference | None = None, has_we
         noise = sum(np.einsum("np,pq,nq->n", each, inverse, each, optimize=True).reshape(-1, 6).sum(axis=0) for each in flat)
         noise = noise * sigma**2 / len(residual)
         gust = _gust_m_s(x, inverse, [at["gust"] for at in own], gusts)
-        if np.all(np.abs(move) < STILL * np.sqrt(np.diag(inverse))):
+        if np.all(np.abs(move) < STEP_TOLERANCE * np.sqrt(np.diag(inverse))):
             break
     lags = [max(1, round(MEMORY_S / float(np.median(np.diff(flight.time_s))))) for flight in flights]
     scores = [np.einsum("nki,nk->ni", slopes, left / sigma**2) for left, slopes in rows]
@@ -118,7 +118,7 @@ def _with_nuisances(mine: Sequence[Unknown], flights: Sequence[Equations]) -> tu
     parts, own = list(mine), []
     for flight in flights:
         nuisances = [*NUISANCES, Unknown("gust", 3 * flight.knots.shape[1], math.inf)]
-        own.append(places(nuisances, sum(u.size for u in parts)))
+        own.append(slices_by_name(nuisances, sum(u.size for u in parts)))
         parts += nuisances
     return parts, own
 

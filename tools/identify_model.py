@@ -80,7 +80,7 @@ NUISANCES = (Unknown("current", 3, 0.3), Unknown("bias", 3, 0.3))
 """Unknowns of one flight: the water's mean velocity, m/s, and the accelerometer's bias, m/s^2."""
 
 
-def places(parts: Sequence[Unknown], first: int = 0) -> dict[str, slice]:
+def slices_by_name(parts: Sequence[Unknown], first: int = 0) -> dict[str, slice]:
     """Slice of each unknown in the vector of all, by name."""
     ends = first + np.cumsum([p.size for p in parts])
     return {p.name: slice(int(end) - p.size, int(end)) for p, end in zip(parts, ends, strict=True)}
@@ -99,7 +99,7 @@ class Weight(NamedTuple):
     """Point of attachment, module frame as in the vehicle file; None: the middle of the hull's bottom."""
 
 
-def beginning(vehicle: Vehicle) -> dict[str, np.ndarray]:
+def initial_values(vehicle: Vehicle) -> dict[str, np.ndarray]:
     """The unknowns at the vehicle file's values."""
     body, count = assemble_vehicle(vehicle), len(vehicle.thruster)
     total = np.diag(body.mass)
@@ -137,7 +137,7 @@ class Equations:
         self.vehicle, self.name = vehicle, recording.name
         self.knots = _knots(self.time_s)
         self._w, self._v_w, self._q = motion.w_b[self._rows], motion.v_w[self._rows], motion.q_wb[self._rows]
-        down = _each(motion.q_wb, np.broadcast_to(DOWN, motion.v_w.shape))
+        down = _to_body(motion.q_wb, np.broadcast_to(DOWN, motion.v_w.shape))
         self._down = down[self._rows]
         lever, slope = recording.body.r_bi[0], np.gradient(motion.w_b, recording.period_s, axis=0)
         moved = _cross(slope, lever) + _cross(motion.w_b, _cross(motion.w_b, lever)) if lever.any() else 0.0
@@ -195,7 +195,7 @@ class Equations:
     def _drag(self, key: str, at: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
         """(n, 3) velocity through the water of a mean (3,) and gusts, and the (n, 3) force for coefficients (1, 0) and (0, 1)."""
         gusts = at[3:].reshape(-1, 3)
-        v = _each(self._q, self._v_w - at[:3] - self.knots[:, : len(gusts)] @ gusts)
+        v = _to_body(self._q, self._v_w - at[:3] - self.knots[:, : len(gusts)] @ gusts)
         speed = np.linalg.norm(v, axis=1, keepdims=True)
         return v, [-np.array([look_up(nodes, row)[:1] for row in np.ascontiguousarray(v)]) * speed * v for nodes in self._nodes]
 
@@ -206,7 +206,7 @@ class Equations:
         return seen if series.ndim > 1 else seen[:, 0]
 
 
-def _each(q: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+def _to_body(q: np.ndarray, vectors: np.ndarray) -> np.ndarray:
     """(n, 3) world vectors, each rotated into the body frame of its attitude."""
     axis = -q[:, 1:]
     twice = 2.0 * _cross(axis, vectors)

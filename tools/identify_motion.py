@@ -77,7 +77,7 @@ def filled(samples: np.ndarray) -> np.ndarray:
     return out
 
 
-def _moved(x, gyro, accel, dt):
+def _predict(x, gyro, accel, dt):
     """State after dt seconds of a mean rate and specific force (3,), and the (15, 15) transition of its error."""
     w, f = gyro - x[10:13], accel - x[13:16]
     half = multiply(x[6:10].copy(), exp(0.5 * dt * w))
@@ -99,7 +99,7 @@ def _moved(x, gyro, accel, dt):
     return out, phi
 
 
-def _corrected(x, covariance, picture, late_s, gyro, variance, gate):
+def _update(x, covariance, picture, late_s, gyro, variance, gate):
     """State and covariance after a picture taken `late_s` after the tick; unchanged where the gate is exceeded."""
     w = gyro - x[10:13]
     q = normalise(multiply(x[6:10].copy(), exp(late_s * w)))
@@ -121,10 +121,10 @@ def _corrected(x, covariance, picture, late_s, gyro, variance, gate):
     gain = ph @ inverse
     keep = np.eye(ERRORS) - gain @ h
     after = keep @ covariance @ keep.T + gain @ np.diag(variance) @ gain.T
-    return _added(x, gain @ residual), after
+    return _apply_error(x, gain @ residual), after
 
 
-def _added(x, e):
+def _apply_error(x, e):
     out = x.copy()
     out[:6] += e[:6]
     out[6:10] = normalise(multiply(x[6:10].copy(), exp(e[6:9].copy())))
@@ -132,7 +132,7 @@ def _added(x, e):
     return out
 
 
-def _taken(a, b):
+def _error_between(a, b):
     """(15,) error that, added to b, gives a."""
     out = np.empty(ERRORS)
     out[:6] = a[:6] - b[:6]
@@ -157,15 +157,15 @@ def _smooth(start, sigma, gyro, accel, dt, density, tags, pictures, variance, ga
     k = 0
     for i in range(n):
         if i > 0:
-            x, phi[i] = _moved(x, 0.5 * (gyro[i - 1] + gyro[i]), 0.5 * (accel[i - 1] + accel[i]), dt)
+            x, phi[i] = _predict(x, 0.5 * (gyro[i - 1] + gyro[i]), 0.5 * (accel[i - 1] + accel[i]), dt)
             p = phi[i] @ p @ phi[i].T + np.diag(density * dt)
         ahead[i], p_ahead[i] = x, p
         while k < tags.shape[0] and tags[k, 0] < i + 0.5:
-            x, p = _corrected(x, p, pictures[k], (tags[k, 0] - i) * dt, gyro[i], variance / tags[k, 1], gate)
+            x, p = _update(x, p, pictures[k], (tags[k, 0] - i) * dt, gyro[i], variance / tags[k, 1], gate)
             k += 1
         after[i], p_after[i] = x, p
     out = after.copy()
     for i in range(n - 2, -1, -1):
         gain = np.linalg.solve(p_ahead[i + 1], phi[i + 1] @ p_after[i]).T
-        out[i] = _added(after[i], gain @ _taken(out[i + 1], ahead[i + 1]))
+        out[i] = _apply_error(after[i], gain @ _error_between(out[i + 1], ahead[i + 1]))
     return out

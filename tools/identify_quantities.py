@@ -49,7 +49,7 @@ class Finding(NamedTuple):
 
 def absolute(fit: Fit, vehicle: Vehicle) -> list[Quantity]:
     """Quantities that need a known scale."""
-    at = fit.places
+    at = fit.slices
     mass, inertia, drag, arm = (at[name].start for name in ("mass", "inertia", "drag", "arm"))
     rotational = assemble_vehicle(vehicle).drag.rotational
     found = [Quantity(f"total mass along {a}", "kg", _exponential(mass + i), f"along {a}") for i, a in enumerate(AXES)]
@@ -67,7 +67,7 @@ def absolute(fit: Fit, vehicle: Vehicle) -> list[Quantity]:
 
 def ratios(fit: Fit) -> list[Quantity]:
     """Quantities that every log gives: the common factor cancels."""
-    at = fit.places
+    at = fit.slices
     mass, gains = at["mass"].start, at["gain"]
 
     def per_mass(name: str, i: int) -> Callable[[np.ndarray], float]:

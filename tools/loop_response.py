@@ -47,9 +47,10 @@ LOWEST_RAD_S, HIGHEST_RAD_S, LINES = 0.3, 30.0, 20
 """Range and number of the excitation frequencies of each axis."""
 SHAKE = np.repeat([0.01, 0.02], 3)
 """Acceleration of one sine, m/s^2 and rad/s^2: their sum stays far from the thrusters' limits."""
-MOST_STRAY = 0.05
-"""Largest stray share of a stable loop. Measured: stable ones up to 0.015, from the beat of tags and ticks; oscillating ones from 0.14."""
-LEAST_SHARE = 0.1
+MAX_OFF_LINE_SHARE = 0.05
+"""Largest `off_line_share` of a stable loop. Measured: stable ones up to 0.015, from the beat of tags and ticks; oscillating ones from
+0.14."""
+MIN_CONTROLLED_SHARE = 0.1
 """Least share of a force or moment requested along one axis that the thrusters must deliver for the axis to count as controlled. The shares
 add up to the rank, so one axis always is. Layout.unreachable is stricter: beside the pitch of a BlueROV2 it lists the surge, which tilts
 it a little.
@@ -88,7 +89,7 @@ class Response(NamedTuple):
 
     frequency: np.ndarray
     loop: np.ndarray
-    stray: float = 0.0
+    off_line_share: float = 0.0
     """Share of the controller's output outside the excitation frequencies: large in a loop that oscillates by itself."""
     controlled: bool = True
     """Whether the thrusters can push along the axis."""
@@ -181,7 +182,7 @@ def _world(body: Body, vehicles: Sequence[Vehicle], lag_s: float) -> World:
 
 def controlled(body: Body) -> np.ndarray:
     """(6,) whether the thrusters can push along each axis."""
-    return np.asarray(np.diag(body.thrusters.matrix @ body.thrusters.pinv) >= LEAST_SHARE)
+    return np.asarray(np.diag(body.thrusters.matrix @ body.thrusters.pinv) >= MIN_CONTROLLED_SHARE)
 
 
 def lines() -> np.ndarray:
@@ -260,7 +261,7 @@ def margins(response: Response) -> Margins:
     """
     if not response.controlled:
         return Margins(math.inf, math.inf, math.nan)
-    if response.stray > MOST_STRAY or np.isnan(response.loop).any():
+    if response.off_line_share > MAX_OFF_LINE_SHARE or np.isnan(response.loop).any():
         return Margins(0.0, 0.0, math.nan)
     gain, phase = read_off(response)
     if not phase:

@@ -165,7 +165,7 @@ def bode(response: Response) -> tuple[np.ndarray, np.ndarray]:
     return gain, phase - 360.0 * round((phase[int(np.argmin(np.abs(gain)))] + 180.0) / 360.0)
 
 
-def leave(out: Path, found: Found) -> int:
+def write_and_report(out: Path, found: Found) -> int:
     """Prints the table and writes margins.json and margins.png; returns the exit status. Raises OSError."""
     table_rows = rows(found)
     print_table(table_rows)
@@ -192,7 +192,7 @@ def main() -> int:
         chosen = CONTROLLERS.get(given.controller) or load_parameters(Path(given.controller))
         with folder_for_results(given.out):
             check_results(given.out, "crossover_rad_s", "margins.json", "margins.png")
-            return leave(given.out, measured(given.modules, chosen, given.vehicle, given.jobs))
+            return write_and_report(given.out, measured(given.modules, chosen, given.vehicle, given.jobs))
     except (DescriptionError, OSError) as error:
         return refuse("margins", error)
 

@@ -121,7 +121,7 @@ def tune(objective: Objective, vehicle: Vehicle, person: Person, steps: int, sec
             put_back(vehicle, json.loads(memory.read_text(encoding="utf-8")), memory)
         before = {name: vehicle.get(name) for name in bounds}
         vehicle.watch(True)
-        vehicle.hear()
+        vehicle.wait_for_heartbeat()
     except TroubleError as error:
         raise DescriptionError(f"--live: {error}; let it hover, armed, before it is tuned") from None
     write_atomically(memory, json.dumps(before).encode())
@@ -185,7 +185,7 @@ def _steps(
         if not np.float32(low) <= np.float32(now[name]) <= np.float32(high):
             leads = f"by a factor of {FACTOR:g} a step at most" if now[name] * (low + high) > 0.0 else "by no factor, so it stays"
             print(f"{name} {now[name]:g} is outside the objective's {low:g} to {high:g}: it moves there {leads}", flush=True)
-    best = _cost(objective, vehicle.look(seconds))
+    best = _cost(objective, vehicle.measure_hover(seconds))
     print(f"as it is: {best:.4f}", flush=True)
     for number, (name, value) in zip(range(1, steps + 1), proposals(now, bounds), strict=False):
         answer = person.answer(f"step {number}: {name} {now[name]:g} -> {value:g}? [y/n/q]")
@@ -194,7 +194,7 @@ def _steps(
         if answer != "y":
             continue
         vehicle.set(name, value)
-        found = _cost(objective, vehicle.look(seconds))
+        found = _cost(objective, vehicle.measure_hover(seconds))
         if found < BETTER * best:
             best, now[name] = found, value
         else:

@@ -14,7 +14,7 @@ from firmware_py.description.schema import DescriptionError
 
 SETTLE_S = 3.0
 """Settling time between a change and its evaluation, by the vehicle's clock."""
-SILENT_S, ANSWER_S, ANSWERS = 5.0, 1.0, 5
+SILENT_S, ANSWER_S, ATTEMPTS = 5.0, 1.0, 5
 """Time without a heartbeat after which the vehicle is lost; timeout of a parameter's answer, and number of attempts."""
 RESTORE_S, PAUSE_S = 60.0, 0.2
 """Timeout for restoring all changed values; pause after a value that was not accepted."""
@@ -69,13 +69,13 @@ class Vehicle:
     def __init__(self, link: Link, clock: Callable[[], float] = time.monotonic, sleep: Callable[[float], None] = time.sleep) -> None:
         """Waits for its heartbeat. Raises DescriptionError when none comes. `clock` and `sleep`: s."""
         self.link, self._clock, self._sleep = link, clock, sleep
-        self._said_s, self._heard_s = -1e9, clock()
+        self._last_sent_s, self._heard_s = -1e9, clock()
         self._mode: int | None = None
         self._watched = False
         self.seen: list[Any] = []
         """Messages since `seen` was last cleared."""
         with suppress(TroubleError):
-            self.hear()
+            self.wait_for_heartbeat()
         if self._mode is None:
             raise DescriptionError(f"--live: no heartbeat in {SILENT_S:g} s; is the vehicle's link set to this address?")
 
@@ -87,15 +87,15 @@ class Vehicle:
 
     def _receive(self, timeout_s: float) -> None:
         now = self._clock()
-        if now - self._said_s > 1.0:
-            self._said_s = now
+        if now - self._last_sent_s > 1.0:
+            self._last_sent_s = now
             self.link.mav.heartbeat_send(ONBOARD_CONTROLLER, INVALID_AUTOPILOT, 0, 0, 4)
         message = self.link.recv_match(blocking=True, timeout=timeout_s)
         while message is not None:
             self._take(message)
             message = self.link.recv_match(blocking=False)
 
-    def hear(self) -> None:
+    def wait_for_heartbeat(self) -> None:
         """Receives messages until the next heartbeat. Raises TroubleError."""
         self.seen.clear()
         while not any(m.get_type() == "HEARTBEAT" for m in self.seen):
@@ -147,7 +147,7 @@ class Vehicle:
         return {name: value for name, value in values.items() if name in left}
 
     def _ask(self, name: str, send: Callable[[], None]) -> float:
-        for _ in range(ANSWERS):
+        for _ in range(ATTEMPTS):
             self.seen.clear()
             send()
             end = self._clock() + ANSWER_S
@@ -156,9 +156,9 @@ class Vehicle:
                 for message in self.seen:
                     if message.get_type() == "PARAM_VALUE" and message.param_id == name:
                         return float(str(np.float32(message.param_value)))
-        raise TroubleError(f"parameter {name}: no answer in {ANSWERS * ANSWER_S:g} s")
+        raise TroubleError(f"parameter {name}: no answer in {ATTEMPTS * ANSWER_S:g} s")
 
-    def look(self, seconds: float) -> dict[str, float]:
+    def measure_hover(self, seconds: float) -> dict[str, float]:
         """Metrics of a hover of `seconds`, after settling: RMS about the mean pose, by the vehicle's own clock and estimate."""
         self.seen.clear()
         began_ms: int | None = None

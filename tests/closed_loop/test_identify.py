@@ -87,7 +87,7 @@ def test_without_a_reference_no_mass_is_stated(
 def test_wrong_shape_of_the_measured_curve_moves_no_gain(equations) -> None:  # type: ignore[no-untyped-def]
     """Reverse is 2 % too strong and small commands some per cent off, as by load-cell noise. Thrusters push more one way than the other."""
     free = without_weight(equations)
-    x = identify_model.beginning(free.vehicle)
+    x = identify_model.initial_values(free.vehicle)
     x["gain"] = x["gain"] * np.linspace(0.95, 1.05, 8)
     x["shape"] = np.array([0.02, 0.02, -0.03, -0.01, 0.02])
     noise = np.random.default_rng(0).standard_normal(free.measured.shape) * np.repeat([0.001, 0.003], 3)
@@ -123,7 +123,7 @@ def test_with_a_curve_it_leaves_a_vehicle_file_of_the_plant(tmp_path: Path, monk
 
 def test_one_factor_of_everything_changes_no_motion(equations) -> None:  # type: ignore[no-untyped-def]
     """The homogeneity of the errata: no log alone determines a mass."""
-    x = identify_model.beginning(equations.vehicle) | {"current": np.array([0.05, -0.02, 0.0]), "bias": np.full(3, 0.03)}
+    x = identify_model.initial_values(equations.vehicle) | {"current": np.array([0.05, -0.02, 0.0]), "bias": np.full(3, 0.03)}
     x["offset"], x["crossflow"], x["weight"] = np.full(3, 0.01), np.full(3, 0.2), np.array([0.3])
     factor, logarithms, rest = 1.3, ("mass", "inertia"), ("lag", "deadband", "shape", "current", "bias")
     scaled = {k: v + np.log(factor) if k in logarithms else v * (1.0 if k in rest else factor) for k, v in x.items()}
@@ -141,7 +141,7 @@ def without_weight(equations):  # type: ignore[no-untyped-def]
 
 def test_known_weight_takes_the_place_of_the_load_cell(equations) -> None:  # type: ignore[no-untyped-def]
     """Uses a flight simulated by the equations with 2 N attached for half of it, plus white noise."""
-    x = identify_model.beginning(equations.vehicle)
+    x = identify_model.initial_values(equations.vehicle)
     x["mass"] = x["mass"] + 0.2
     x["gain"] = x["gain"] * np.linspace(1.1, 1.3, 8)
     carried = copy.copy(equations)
@@ -152,7 +152,7 @@ def test_known_weight_takes_the_place_of_the_load_cell(equations) -> None:  # ty
     assert result.has_scale
     for name in ("mass", "gain"):
         for i, true in enumerate(x[name]):
-            value, half_width = result.interval(lambda found, at=result.places[name].start + i: float(found[at]))
+            value, half_width = result.interval(lambda found, at=result.slices[name].start + i: float(found[at]))
             assert value == pytest.approx(true, abs=max(2.0 * half_width, 1e-3))
             assert half_width < 0.1
 

@@ -209,7 +209,7 @@ def test_what_makes_the_hover_stiller_stays_and_the_rest_goes_back_at_once(
         robot.wait(0.1)
         return {"position_rmse_m": 0.001 * robot.control.position_bandwidth}
 
-    monkeypatch.setattr(live.Vehicle, "look", look)
+    monkeypatch.setattr(live.Vehicle, "measure_hover", look)
     flown: list[float] = []
 
     class Watching(Scripted):
@@ -350,7 +350,7 @@ def test_vehicle_that_is_heard_again_within_a_minute_gets_its_old_values(
     live: Any, robot: Robot, tuned: Callable[..., int], tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The link is cut during the look, which ends after 5 s of silence."""
-    look = live.Vehicle.look
+    look = live.Vehicle.measure_hover
 
     def cut(vehicle: Any, seconds: float) -> Any:
         robot.wait(0.1)
@@ -358,7 +358,7 @@ def test_vehicle_that_is_heard_again_within_a_minute_gets_its_old_values(
             robot.silent_until_s = robot.clock() + 40.0
         return look(vehicle, seconds)
 
-    monkeypatch.setattr(live.Vehicle, "look", cut)
+    monkeypatch.setattr(live.Vehicle, "measure_hover", cut)
     assert tuned(Scripted("y")) == 1
     said = capsys.readouterr().out
     assert "has been silent for 5 s" in said and f"old values are back: {OLD}" in said

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from blind_floor import PERIOD_S, PLACE, RATE, STATES, TENDS, TILT, WATER, floor, model, without_tags
+from blind_floor import GUST_TARGET, PERIOD_S, PLACE, RATE, STATES, TILT, WATER, floor, model, without_tags
 
 from firmware_py.description.vehicle import load_vehicle
 from hil.plant.bodies import weigh
@@ -61,6 +61,6 @@ def test_water_that_accelerates_turns_the_robot_as_it_turns_the_plants() -> None
     lifted_at, displaced_at = tuple(lift * c for c in up), tuple(mass * c for c in up)
     _, moment = weigh(lift, nowhere, lift, lifted_at, mass, displaced_at, level, (rate, 0.0, 0.0))
     step = model(world, SensorSpec(), vehicle, 0.0).step
-    accelerating, leaning = rate * world.gust_smoothing_s * step[RATE, TENDS], -rate / world.gravity * step[RATE, TILT]
+    accelerating, leaning = rate * world.gust_smoothing_s * step[RATE, GUST_TARGET], -rate / world.gravity * step[RATE, TILT]
     assert accelerating == pytest.approx(moment[1] / inertia * PERIOD_S, rel=0.02)
     assert accelerating + leaning == pytest.approx(0.0, abs=0.02 * abs(leaning)), "it hangs along the gravity that it feels"

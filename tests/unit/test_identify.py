@@ -154,7 +154,7 @@ def made_up(
 
 def test_gusts_are_found_beside_the_drag_and_leave_it_alone() -> None:
     flight, rng = made_up(), np.random.default_rng(1)
-    x = model.beginning(flight.vehicle) | {"current": np.array([0.04, 0.0, -0.03]), "bias": np.zeros(3)}
+    x = model.initial_values(flight.vehicle) | {"current": np.array([0.04, 0.0, -0.03]), "bias": np.zeros(3)}
     covariance = np.linalg.inv(model.gust_precision(flight.knots.shape[1]))
     assert np.diag(covariance) == pytest.approx(1.0)
     gusts = 0.05 * np.linalg.cholesky(covariance) @ rng.standard_normal((len(covariance), 3))
@@ -165,7 +165,7 @@ def test_gusts_are_found_beside_the_drag_and_leave_it_alone() -> None:
     assert found.gust_m_s == pytest.approx(0.05, rel=0.35)
     assert found.residual == pytest.approx(np.repeat([0.003, 0.006], 3), rel=0.15)
     for i, name in enumerate(("cd_face", "cd_edge")):
-        value, half_width = found.interval(lambda u, i=i: float(u[found.places["drag"]][i]))  # type: ignore[misc]
+        value, half_width = found.interval(lambda u, i=i: float(u[found.slices["drag"]][i]))  # type: ignore[misc]
         assert abs(value - getattr(flight.vehicle.drag, name)) < 1.5 * half_width
 
 
@@ -192,7 +192,7 @@ def test_weight_that_pulls_at_an_arm_is_not_taken_for_righting(at_m: tuple[float
     weight = model.Weight(2.0, 0.22, 10.0, 20.0)
     place = at_m or (0.0, 0.0, 0.105)  # half the hull's height below its middle
     flight, centred = made_up(weight._replace(at_m=at_m), com), made_up(weight._replace(at_m=com), com)
-    x = model.beginning(flight.vehicle) | {"current": np.zeros(3), "bias": np.zeros(3)}
+    x = model.initial_values(flight.vehicle) | {"current": np.zeros(3), "bias": np.zeros(3)}
     x["mass"], x["gain"] = x["mass"] + 0.1, 1.1 * x["gain"]
     noise = np.random.default_rng(1).standard_normal(flight.measured.shape) * np.repeat([0.001, 0.003], 3)
     flight.measured = hang(centred, x, np.array(place) - com, noise)
@@ -286,7 +286,7 @@ def test_what_a_vehicle_carries_is_written_once(loads: int) -> None:
     """A fit that changed nothing gives the vehicle unchanged."""
     box = Payload(name="box", dry_kg=1.5, entrained_kg=0.2, size_m=np.array([0.1, 0.1, 0.2]), position_m=np.array([0.0, 0.05, 0.15]))
     vehicle = dataclasses.replace(load_vehicle("modcube"), payload=(box,) * loads)
-    found = quantities.fitted_vehicle(SimpleNamespace(value=model.beginning(vehicle).get), vehicle, vehicle.curve, "none")
+    found = quantities.fitted_vehicle(SimpleNamespace(value=model.initial_values(vehicle).get), vehicle, vehicle.curve, "none")
     np.testing.assert_allclose(np.diag(assemble_vehicle(found).mass), np.diag(assemble_vehicle(vehicle).mass))
     np.testing.assert_allclose(found.inertial.added, vehicle.inertial.added, atol=1e-12)
     assert found.inertial.righting_arm_m == pytest.approx(vehicle.inertial.righting_arm_m)
