@@ -126,9 +126,9 @@ def _body_of(cells: list[tuple[int, int, int]], first: int) -> Body:
     return assemble(cells, [0] * len(cells), [MODCUBE] * len(cells), list(range(first, first + len(cells))))
 
 
-class Docked(Tank):
-    """A tank with faults: modules whose magnets carry no current (`weak`), whose magnets pull whatever the command (`hung`), or whose tags
-    are out of sight (`hidden`). With `stuck`, joints that push apart are still seen in their places.
+class FaultyTank(Tank):
+    """A tank with faults: modules whose magnets carry no current (`without_current`), whose magnets pull whatever the command
+    (`always_pulling`), or whose tags are out of sight (`hidden`). With `stuck`, joints that push apart are still seen in their places.
     """
 
     def __init__(
@@ -139,12 +139,12 @@ class Docked(Tank):
         size = 1 if apart else each or count
         super().__init__([_body_of(cells[m : m + size], m) for m in range(0, count, size)], parameters)
         self.cabin_pa = [101_325.0] * count
-        self.weak: set[int] = set()
+        self.without_current: set[int] = set()
         self.hidden: set[int] = set()
-        self.hung: set[int] = set()
+        self.always_pulling: set[int] = set()
         self.pull_ma = 110.0
         self.stuck = False
-        self.said: list[tuple[float, str]] = []
+        self.event_log: list[tuple[float, str]] = []
         self._delay, self._plans = delay, list[tuple[int, Prepared]]()
         self._step, self.pipeline.step = self.pipeline.step, self._step_with_plans  # type: ignore[method-assign]
 
@@ -157,8 +157,8 @@ class Docked(Tank):
             if m in self.hidden or m in pushing[1:]:  # modules that push each other apart are not all seen in their places
                 module.tags.clear()
             if tick % 4 == 0:
-                turned = [state == RELAY_PUSH and m not in self.hung for state in relays[m]]
-                current = [0.0 if m in self.weak else -self.pull_ma if turns else self.pull_ma for turns in turned]
+                turned = [state == RELAY_PUSH and m not in self.always_pulling for state in relays[m]]
+                current = [0.0 if m in self.without_current else -self.pull_ma if turns else self.pull_ma for turns in turned]
                 module.docks = [DockFeedback(first, (*current[first : first + 3],), (1, 1, 1)) for first in (0, 3)]  # type: ignore[arg-type]
         return modules
 
@@ -169,7 +169,7 @@ class Docked(Tank):
         for request in outputs.preparations:
             plan = prepare(request, self.pipeline, [MODCUBE] * len(inputs.modules), PITCH_M)
             self._plans.append((inputs.tick + 1 + self._delay, plan))
-        self.said += [(1e-9 * inputs.time_ns, event.text) for event in outputs.events]
+        self.event_log += [(1e-9 * inputs.time_ns, event.text) for event in outputs.events]
         return outputs
 
     def fly(self) -> None:
@@ -179,7 +179,7 @@ class Docked(Tank):
 
     def lose(self, *modules: int) -> float:
         """Takes the modules out of sight and the current from their magnets; returns the time, s."""
-        self.weak |= set(modules)
+        self.without_current |= set(modules)
         self.hidden |= set(modules)
         return len(self.outputs) * 0.01
 
@@ -188,14 +188,16 @@ class Docked(Tank):
         return sorted(body.modules for body in self.pipeline.bodies)
 
     def when(self, text: str) -> float:
-        return next(at for at, said in self.said if text in said)
+        return next(at for at, said in self.event_log if text in said)
 
 
-def placed(*places: tuple[float, float], parameters: Parameters | None = None, armed: tuple[int, ...] | None = None) -> Docked:
+def tank_with_modules_at(
+    *places: tuple[float, float], parameters: Parameters | None = None, armed: tuple[int, ...] | None = None
+) -> FaultyTank:
     """Single modules at these places (north, east, m), which hold there once armed: all, or those in `armed`. No magnet draws current."""
     modules = range(len(places))
-    tank = Docked([(0, m, 0) for m in modules], parameters, apart=True)
-    tank.weak = set(modules)
+    tank = FaultyTank([(0, m, 0) for m in modules], parameters, apart=True)
+    tank.without_current = set(modules)
     for state, (north, east) in zip(tank.states, places, strict=True):
         state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
@@ -203,6 +205,6 @@ def placed(*places: tuple[float, float], parameters: Parameters | None = None, a
     return tank
 
 
-def before_each_other(*y_m: float, parameters: Parameters | None = None, armed: tuple[int, ...] | None = None) -> Docked:
-    """Modules in one line, set up as by `placed`: the first at 0, the others `y_m` east of it."""
-    return placed(*((1.0, y) for y in (0.0, *y_m)), parameters=parameters, armed=armed)
+def tank_with_row(*y_m: float, parameters: Parameters | None = None, armed: tuple[int, ...] | None = None) -> FaultyTank:
+    """Modules in one line, set up as by `tank_with_modules_at`: the first at 0, the others `y_m` east of it."""
+    return tank_with_modules_at(*((1.0, y) for y in (0.0, *y_m)), parameters=parameters, armed=armed)

@@ -12,13 +12,13 @@ from firmware_py.core.setpoint import rest_at
 from firmware_py.core.types import Action, DockRequest, Mode, Request, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.prepare.assembly import PITCH_M
-from tests.unit.tanks import Docked, before_each_other, placed
+from tests.unit.tanks import FaultyTank, tank_with_modules_at, tank_with_row
 
 
 @pytest.mark.slow
 def test_pilot_of_the_target_feels_no_blow_when_another_docks_to_it() -> None:
     wide = Parameters().replace("docking.push_m", 0.0).replace("docking.position_tolerance_m", 0.1).replace("docking.settled_m", 0.1)
-    tank = Docked([(0, 0, 0), (0, 1, 0)], wide, apart=True)
+    tank = FaultyTank([(0, 0, 0), (0, 1, 0)], wide, apart=True)
     for state, east in zip(tank.states, (0.0, PITCH_M), strict=True):
         state[:7] = [1.0, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
@@ -41,7 +41,7 @@ def test_pilot_of_the_target_feels_no_blow_when_another_docks_to_it() -> None:
 
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_target_that_is_disarmed_is_not_expected_to_come(approach: str) -> None:
-    tank = before_each_other(2.0, parameters=Parameters().replace("docking.approach", approach), armed=(1,))
+    tank = tank_with_row(2.0, parameters=Parameters().replace("docking.approach", approach), armed=(1,))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     (dock,) = tank.pipeline.formation.docking._docks
     assert dock.sequence.meets_at_w is None and tank.pipeline.formation.pipelines[0].guidance._goal is None
@@ -51,7 +51,7 @@ def test_target_that_is_disarmed_is_not_expected_to_come(approach: str) -> None:
 @pytest.mark.parametrize("ring", [False, True])
 def test_bodies_that_are_to_dock_to_each_other_do_not_chase_each_other(ring: bool) -> None:
     places = [(1.0, 0.0), (1.5, 0.5), (0.4, 0.8)][: 3 if ring else 2]
-    tank = placed(*places)
+    tank = tank_with_modules_at(*places)
     wanted = [DockRequest(1, 3, 0, 2), DockRequest(2, 3, 1, 2), DockRequest(0, 1, 2, 0)] if ring else [
         DockRequest(1, 3, 0, 2), DockRequest(0, 0, 1, 1)
     ]
@@ -63,7 +63,7 @@ def test_bodies_that_are_to_dock_to_each_other_do_not_chase_each_other(ring: boo
 
 @pytest.mark.slow
 def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
-    tank = before_each_other(2.0)
+    tank = tank_with_row(2.0)
     for turns in (0, 1, 0, 1):
         tank.run(0.2, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, turns, True)))
     goal = tank.pipeline.formation.pipelines[0].guidance._goal
@@ -74,7 +74,7 @@ def test_target_that_comes_is_sent_on_once_however_often_one_asks() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("stop", [Request(Action.DISARM, 1), Request(Action.SET_MODE, 1, Mode.MANUAL)], ids=["DISARM", "mode"])
 def test_target_does_not_come_to_meet_a_robot_that_has_left_the_dock_before_it_was_planned(stop: Request) -> None:
-    tank = before_each_other(2.0)
+    tank = tank_with_row(2.0)
     tank._delay = 30
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     tank.run(1.0, stop)
@@ -84,7 +84,7 @@ def test_target_does_not_come_to_meet_a_robot_that_has_left_the_dock_before_it_w
 
 @pytest.mark.slow
 def test_target_that_comes_goes_back_when_the_dock_is_called_off() -> None:
-    tank = before_each_other(2.0)
+    tank = tank_with_row(2.0)
     held = tank.pipeline.formation.pipelines[0].guidance._glider.at.p_wb.copy()
     tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     tank.run(0.1, Request(Action.SET_MODE, 1, Mode.POSHOLD))
@@ -95,7 +95,7 @@ def test_target_that_comes_goes_back_when_the_dock_is_called_off() -> None:
 
 @pytest.mark.slow
 def test_target_that_comes_goes_back_when_the_body_that_it_comes_to_meet_is_taken_apart() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0)] * 2, each=2)
+    tank = FaultyTank([(0, 0, 0), (0, 1, 0)] * 2, each=2)
     for state, east in zip(tank.states, (0.0, 2.4), strict=True):
         state[:7] = [1.0, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
@@ -114,7 +114,7 @@ LEFTWARDS = Request(Action.STICKS, 0, Sticks((0.0, -1.0, 0.0)))
 @pytest.mark.slow
 @pytest.mark.parametrize("move", [ELSEWHERE, LEFTWARDS], ids=["sent", "steered"])
 def test_target_that_came_and_was_moved_by_a_person_since_stays_there_when_the_dock_is_called_off(move: Request) -> None:
-    tank = before_each_other(3.0)
+    tank = tank_with_row(3.0)
     tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     guidance = tank.pipeline.formation.pipelines[0].guidance
     assert guidance._goal is not None
@@ -127,7 +127,7 @@ def test_target_that_came_and_was_moved_by_a_person_since_stays_there_when_the_d
 
 @pytest.mark.slow
 def test_nobody_docks_to_a_body_that_surfaces() -> None:
-    tank = before_each_other(2.0)
+    tank = tank_with_row(2.0)
     outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     assert outputs.docks and outputs.records[1].mode == Mode.DOCK
     outputs = tank.run(0.1, Request(Action.SET_MODE, 0, Mode.SURFACE))
@@ -138,7 +138,7 @@ def test_nobody_docks_to_a_body_that_surfaces() -> None:
 
 @pytest.mark.slow
 def test_target_comes_to_meet_the_first_of_two_alone() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0), (0, -1, 0)], apart=True)
+    tank = FaultyTank([(0, 0, 0), (0, 1, 0), (0, -1, 0)], apart=True)
     for state, y in zip(tank.states, (0.0, 2.0, -1.5), strict=True):
         state[:7] = [1.0, y, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
@@ -153,7 +153,7 @@ def test_target_comes_to_meet_the_first_of_two_alone() -> None:
 
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_dock_whose_way_leads_through_a_third_body_is_refused(approach: str) -> None:
-    tank = placed((1.0, 0.0), (1.0, 2.0), (1.1, 1.0), parameters=Parameters().replace("docking.approach", approach))
+    tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (1.1, 1.0), parameters=Parameters().replace("docking.approach", approach))
     outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     assert tank.when("dock refused: on its way it would come too near to module 2")
     assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD and abs(tank.states[1][1] - 2.0) < 0.05
@@ -161,7 +161,7 @@ def test_dock_whose_way_leads_through_a_third_body_is_refused(approach: str) -> 
 
 def test_dock_whose_target_would_come_through_a_third_body_is_refused() -> None:
     """The active body goes level to the stand-off; the target, which comes half of that way, has another body beside it."""
-    tank = placed((1.0, 0.0), (2.0, 1.5), (1.0, 0.45))
+    tank = tank_with_modules_at((1.0, 0.0), (2.0, 1.5), (1.0, 0.45))
     tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 1, 0, 0, 0, True)))
     assert tank.when("dock refused: module 0, which is to meet it, would come too near to module 2")
     outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 1, 0, 0)))
@@ -170,18 +170,18 @@ def test_dock_whose_target_would_come_through_a_third_body_is_refused() -> None:
 
 @pytest.mark.parametrize("north_m", [0.45, -0.45])
 def test_dock_past_a_third_body_that_leaves_room_is_begun(north_m: float) -> None:
-    tank = placed((1.0, 0.0), (1.0, 2.0), (1.0 + north_m, 1.0))
+    tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (1.0 + north_m, 1.0))
     outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     assert len(outputs.docks) == 1 and outputs.records[1].mode == Mode.DOCK
 
 
 @pytest.mark.slow
 def test_dock_waits_while_a_third_body_is_on_its_way_and_then_goes_on() -> None:
-    tank = placed((1.0, 0.0), (1.0, 2.0), (1.6, 1.0))
+    tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (1.6, 1.0))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     tank.run(8.0, Request(Action.HOLD, 2, rest_at(np.array([1.0, 1.0, 0.8]), np.array([1.0, 0.0, 0.0, 0.0]))))
     assert tank.when("dock of module 1 waits: module 2 is on its way")
-    assert sum("waits" in said for _, said in tank.said) == 1
+    assert sum("waits" in said for _, said in tank.event_log) == 1
     assert min(np.linalg.norm(past[1][:3] - past[2][:3]) for past in tank.past) > 0.4
     assert tank.outputs[-1].docks[0].stage == Stage.PRE_APPROACH
     tank.run(0.1, Request(Action.HOLD, 2, rest_at(np.array([1.6, 1.0, 0.8]), np.array([1.0, 0.0, 0.0, 0.0]))))
@@ -193,13 +193,13 @@ def test_dock_waits_while_a_third_body_is_on_its_way_and_then_goes_on() -> None:
 
 def test_dock_says_of_each_module_once_that_it_waits_though_two_are_as_near() -> None:
     """Noise decides which of two modules on the way is the nearer one."""
-    tank = placed((1.0, 0.0), (1.0, 2.0), (1.6, 0.9), (1.6, 1.3))
+    tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (1.6, 0.9), (1.6, 1.3))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     met = cycle([2, 3])
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("firmware_py.core.docking_traffic.first_blocking_module", lambda *_: next(met))
         tank.run(0.2)
-    assert [said for _, said in tank.said if "waits" in said] == [f"dock of module 1 waits: module {m} is on its way" for m in (2, 3)]
+    assert [said for _, said in tank.event_log if "waits" in said] == [f"dock of module 1 waits: module {m} is on its way" for m in (2, 3)]
 
 
 LEVEL, DIAGONAL = (from_euler(0.0, 0.0, yaw) for yaw in (0.0, 0.25 * np.pi))
@@ -222,12 +222,12 @@ def test_approach_waits_while_a_third_body_is_in_its_way_and_then_goes_on(
     approach: str, east_m: float, there: tuple[float, float, np.ndarray]
 ) -> None:
     parameters = Parameters().replace("docking.approach", approach)
-    tank = placed((1.0, 0.0), (1.0, east_m), (1.6, there[1]), parameters=parameters, armed=(1, 2))
+    tank = tank_with_modules_at((1.0, 0.0), (1.0, east_m), (1.6, there[1]), parameters=parameters, armed=(1, 2))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     tank.run(10.0, send(2, *there))
     (dock,) = tank.outputs[-1].docks
     assert dock.stage == Stage.APPROACH and dock.gap_m > 0.03
-    assert [said for _, said in tank.said if "waits" in said] == ["dock of module 1 waits: module 2 is on its way"]
+    assert [said for _, said in tank.event_log if "waits" in said] == ["dock of module 1 waits: module 2 is on its way"]
     assert min(np.linalg.norm(past[1][:3] - past[2][:3]) for past in tank.past) > 0.26
     tank.run(0.1, send(2, 1.6, there[1]))
     while tank.outputs[-1].docks[0].stage == Stage.APPROACH and len(tank.outputs) < 6000:
@@ -238,7 +238,7 @@ def test_approach_waits_while_a_third_body_is_in_its_way_and_then_goes_on(
 @pytest.mark.slow
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_target_that_comes_stops_before_a_third_body_and_goes_back(approach: str) -> None:
-    tank = placed((1.0, 0.0), (1.0, 2.4), (1.6, 0.75), parameters=Parameters().replace("docking.approach", approach))
+    tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.4), (1.6, 0.75), parameters=Parameters().replace("docking.approach", approach))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     outputs = tank.run(8.0, send(2, 1.0, 0.75))
     assert tank.when("dock of module 1 ended: module 2 is where module 0 comes to meet it")
@@ -249,34 +249,34 @@ def test_target_that_comes_stops_before_a_third_body_and_goes_back(approach: str
 
 @pytest.mark.slow
 def test_later_of_two_docks_that_are_on_each_other_s_ways_makes_room() -> None:
-    tank = placed((1.0, 0.0), (1.0, 2.0), (0.0, 1.0), (2.0, 1.0))
+    tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (0.0, 1.0), (2.0, 1.0))
     wanted = DockRequest(1, 3, 0, 2), DockRequest(3, 1, 2, 0)
     tank.run(0.1, *(Request(Action.DOCK, request.module, request) for request in wanted))
     outputs = tank.run(12.0)
     assert [dock.stage for dock in outputs.docks] == [Stage.APPROACH] * 2
-    assert sum("gives way" in said for _, said in tank.said) == 1 and tank.when("dock of module 3 gives way to another")
+    assert sum("gives way" in said for _, said in tank.event_log) == 1 and tank.when("dock of module 3 gives way to another")
     assert min(np.linalg.norm(past[1][:3] - past[3][:3]) for past in tank.past) > 0.35
 
 
 @pytest.mark.slow
 def test_dock_that_cannot_go_back_to_make_room_is_given_way_to_by_the_other() -> None:
-    tank = placed((1.0, 0.0), (1.0, 2.0), (0.0, 1.0), (2.0, 1.0), (2.2, 1.6))
+    tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (0.0, 1.0), (2.0, 1.0), (2.2, 1.6))
     wanted = DockRequest(1, 3, 0, 2), DockRequest(3, 1, 2, 0)
     tank.run(0.1, *(Request(Action.DOCK, request.module, request) for request in wanted))
     tank.run(6.0, send(4, 1.9, 1.0))
     outputs = tank.run(9.0)
     assert [Stage.APPROACH <= dock.stage <= Stage.VERIFY for dock in outputs.docks] == [True] * 2
-    assert [said for _, said in tank.said if "gives way" in said] == ["dock of module 1 gives way to another"]
+    assert [said for _, said in tank.event_log if "gives way" in said] == ["dock of module 1 gives way to another"]
     assert min(np.linalg.norm(past[3][:3] - past[n][:3]) for past in tank.past for n in (1, 4)) > 0.35
 
 
 @pytest.mark.slow
 def test_earlier_of_two_docks_makes_room_where_the_later_one_s_room_is_on_its_way() -> None:
     """The earlier dock's target is sent elsewhere, so that its new way leads through the place where the later dock began."""
-    tank = placed((1.0, 0.0), (1.0, 2.0), (0.0, 1.0), (2.0, 1.0), parameters=Parameters().replace("docking.timeout_s", 30.0))
+    tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (0.0, 1.0), (2.0, 1.0), parameters=Parameters().replace("docking.timeout_s", 30.0))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     tank.run(1.0, Request(Action.DOCK, 3, DockRequest(3, 1, 2, 0)))
-    while not any("gives way" in said for _, said in tank.said):
+    while not any("gives way" in said for _, said in tank.event_log):
         tank.run(0.01)
     tank.run(0.1, send(0, 2.5, 0.3))
     outputs = tank.run(17.0)
@@ -288,17 +288,17 @@ def test_earlier_of_two_docks_makes_room_where_the_later_one_s_room_is_on_its_wa
 @pytest.mark.slow
 def test_dock_to_a_target_that_comes_to_meet_another_waits_until_it_is_there() -> None:
     """It used to go in front of the face, into the target's way, and so ended the other's dock."""
-    tank = placed((1.0, 0.0), (2.4, 1.4), (1.75, -0.3))
+    tank = tank_with_modules_at((1.0, 0.0), (2.4, 1.4), (1.75, -0.3))
     tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     outputs = tank.run(10.0, Request(Action.DOCK, 2, DockRequest(2, 1, 0, 0)))
-    assert len(outputs.docks) == 2 and not any("ended" in said for _, said in tank.said)
-    assert [said for _, said in tank.said if "waits" in said] == ["dock of module 2 waits: module 0 is on its way"]
+    assert len(outputs.docks) == 2 and not any("ended" in said for _, said in tank.event_log)
+    assert [said for _, said in tank.event_log if "waits" in said] == ["dock of module 2 waits: module 0 is on its way"]
 
 
 @pytest.mark.slow
 def test_straight_line_to_a_target_that_comes_to_meet_another_is_drawn_once_it_is_there() -> None:
     """It used to be drawn at once, to a place that the target was leaving for good."""
-    tank = placed((1.0, 0.0), (2.4, 1.4), (1.75, -0.3), parameters=Parameters().replace("docking.approach", "straight"))
+    tank = tank_with_modules_at((1.0, 0.0), (2.4, 1.4), (1.75, -0.3), parameters=Parameters().replace("docking.approach", "straight"))
     tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     tank.run(0.1, Request(Action.DOCK, 2, DockRequest(2, 1, 0, 0)))
     first, second = (dock.sequence for dock in tank.pipeline.formation.docking._docks)
@@ -311,20 +311,20 @@ def test_straight_line_to_a_target_that_comes_to_meet_another_is_drawn_once_it_i
 
 @pytest.mark.slow
 def test_target_that_was_sent_elsewhere_is_on_no_way_to_the_place_where_it_was_to_meet() -> None:
-    tank = placed((1.0, 0.0), (1.0, 2.4), (2.0, 0.75))
+    tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.4), (2.0, 0.75))
     tank.run(1.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     tank.run(3.0, send(0, 1.0, 0.0))
     outputs = tank.run(3.0, send(2, 1.0, 0.75))
-    assert len(outputs.docks) == 1 and not any("ended" in said for _, said in tank.said)
+    assert len(outputs.docks) == 1 and not any("ended" in said for _, said in tank.event_log)
 
 
 @pytest.mark.slow
 def test_target_that_has_come_and_is_pushed_a_little_beside_a_third_body_still_has_come() -> None:
-    tank = placed((1.0, 0.0), (1.0, 1.4), (1.6, 0.535))
+    tank = tank_with_modules_at((1.0, 0.0), (1.0, 1.4), (1.6, 0.535))
     tank.run(7.0, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     tank.run(5.0, send(2, 1.25, 0.535))
     (dock,) = tank.pipeline.formation.docking._docks
     tank.states[0][19] = -4.0
     tank.run(0.5)
     assert np.linalg.norm(tank.states[0][:3] - dock.sequence.meets_at_w) > 0.006
-    assert not any("comes to meet it" in said for _, said in tank.said)
+    assert not any("comes to meet it" in said for _, said in tank.event_log)

@@ -18,7 +18,7 @@ from tests.unit.dock_follower import LEVEL, STAGED, estimate
 Place = tuple[float, float]
 VEHICLES = [load_vehicle("modcube")] * 4
 BODIES = [assemble([(0, 0, 0)], [0], VEHICLES[:1], [m]) for m in range(4)]
-BESIDE, AWAY, BACK, THERE = (0.24, 0.05), (0.6, -0.3), (-0.6, 0.5), (0.06, 0.9)
+PASSER_BLOCKING, PASSER_CLEAR, OTHER_CLEAR, OTHER_BLOCKING = (0.24, 0.05), (0.6, -0.3), (-0.6, 0.5), (0.06, 0.9)
 """Places where docks began. Of the body that passes the other's face: beside the target, and farther off; of the other: clear of that way,
 and on it."""
 
@@ -42,7 +42,7 @@ def waits(
     """Wishes, or None, of the passer (module 2, on its way to 3) and of the body before its target's face (module 1, docking to 0)."""
     passer = dock(DockRequest(2, 2, 3, 3), began[0], Stage.PRE_APPROACH)
     before = dock(DockRequest(1, 3, 0, 2), began[1], stage, makes_room)
-    places = [(0.0, 0.0), (0.0, 0.33), BESIDE, (0.04, 1.36)]
+    places = [(0.0, 0.0), (0.0, 0.33), PASSER_BLOCKING, (0.04, 1.36)]
     estimates = {m: (BODIES[m], estimate(np.array([*places[m], 0.0]))) for m in range(4)}
     docks = [passer, before] if passer_first else [before, passer]
     traffic = Traffic(docks, estimates, [], STAGED)
@@ -56,36 +56,36 @@ def is_at(wish: Wish | None, place: Place) -> bool:
 
 @pytest.mark.parametrize("passer_first", [True, False])
 def test_later_of_two_that_wait_for_each_other_makes_room(passer_first: bool) -> None:
-    passer, before = waits((AWAY, BACK), passer_first=passer_first)
+    passer, before = waits((PASSER_CLEAR, OTHER_CLEAR), passer_first=passer_first)
     if passer_first:
-        assert passer is REST and is_at(before, BACK)
+        assert passer is REST and is_at(before, OTHER_CLEAR)
     else:
-        assert is_at(passer, AWAY) and before is REST
+        assert is_at(passer, PASSER_CLEAR) and before is REST
 
 
 @pytest.mark.parametrize("passer_first", [True, False])
 def test_other_makes_room_where_the_later_would_be_in_the_way_there_too(passer_first: bool) -> None:
-    passer, before = waits((AWAY, THERE) if passer_first else (BESIDE, BACK), passer_first=passer_first)
+    passer, before = waits((PASSER_CLEAR, OTHER_BLOCKING) if passer_first else (PASSER_BLOCKING, OTHER_CLEAR), passer_first=passer_first)
     if passer_first:
-        assert is_at(passer, AWAY) and before is REST
+        assert is_at(passer, PASSER_CLEAR) and before is REST
     else:
-        assert passer is REST and is_at(before, BACK)
+        assert passer is REST and is_at(before, OTHER_CLEAR)
 
 
 def test_where_neither_can_make_room_both_wait() -> None:
-    assert waits((BESIDE, THERE)) == (REST, REST)
+    assert waits((PASSER_BLOCKING, OTHER_BLOCKING)) == (REST, REST)
 
 
 def test_room_is_made_until_it_is_there_and_not_begun_by_one_that_is_on_no_way_itself() -> None:
-    assert waits((AWAY, BACK), Stage.PRE_APPROACH) == (REST, None)
-    passer, before = waits((AWAY, BACK), Stage.PRE_APPROACH, makes_room=True)
-    assert passer is REST and is_at(before, BACK)
+    assert waits((PASSER_CLEAR, OTHER_CLEAR), Stage.PRE_APPROACH) == (REST, None)
+    passer, before = waits((PASSER_CLEAR, OTHER_CLEAR), Stage.PRE_APPROACH, makes_room=True)
+    assert passer is REST and is_at(before, OTHER_CLEAR)
 
 
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_straight_approach_does_not_wait_for_who_is_beside_a_stand_off_that_it_does_not_go_to(approach: str) -> None:
     """It used to wait for that body before it had set off, until it timed out."""
-    mine = dock(DockRequest(1, 3, 0, 2), BACK, Stage.PRE_APPROACH)
+    mine = dock(DockRequest(1, 3, 0, 2), OTHER_CLEAR, Stage.PRE_APPROACH)
     places = [(0.0, 0.0), (-0.8, 0.3), (0.25, 0.5)]
     estimates = {m: (BODIES[m], estimate(np.array([*place, 0.0]))) for m, place in enumerate(places)}
     waits = Traffic([mine], estimates, [], Docking(approach=approach)).wait(mine)

@@ -10,14 +10,14 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockRequest, Mode, Request, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.prepare.assembly import PITCH_M
-from tests.unit.tanks import RING, Docked, before_each_other
+from tests.unit.tanks import RING, FaultyTank, tank_with_row
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("stop", ["e-stop", "DISARM"])
 def test_dock_ends_with_an_e_stop_or_disarming_and_is_not_gone_on_with(stop: str) -> None:
-    tank = Docked(RING[:2], apart=True)
-    tank.weak = {0, 1}
+    tank = FaultyTank(RING[:2], apart=True)
+    tank.without_current = {0, 1}
     tank.states[1][1] = 0.6
     tank.run(2.0)
     tank.run(3.0, Request(Action.ARM, 0), Request(Action.ARM, 1))
@@ -41,7 +41,7 @@ def test_dock_ends_with_an_e_stop_or_disarming_and_is_not_gone_on_with(stop: str
 
 @pytest.mark.slow
 def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0), (0, -1, 0)], Parameters().replace("docking.push_m", 0.0), apart=True)
+    tank = FaultyTank([(0, 0, 0), (0, 1, 0), (0, -1, 0)], Parameters().replace("docking.push_m", 0.0), apart=True)
     for state, side in zip(tank.states, (0.0, PITCH_M, -PITCH_M), strict=True):
         state[:7] = [1.0, side, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
@@ -61,7 +61,7 @@ def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
 
 @pytest.mark.slow
 def test_dock_from_afar_glides_to_the_stand_off_and_keeps_it() -> None:
-    tank, near, fastest = before_each_other(2.0), [], []
+    tank, near, fastest = tank_with_row(2.0), [], []
     first = len(tank.outputs)
     tank.run(0.03, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     while tank.outputs[-1].docks[0].stage == Stage.PRE_APPROACH:
@@ -78,20 +78,20 @@ def test_dock_from_afar_glides_to_the_stand_off_and_keeps_it() -> None:
 
 
 def test_dock_whose_way_leads_through_the_target_is_refused() -> None:
-    tank = before_each_other(2.0)
+    tank = tank_with_row(2.0)
     outputs = tank.run(3.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
     assert tank.when("dock refused: on its way it would come too near to module 0")
     assert outputs.records[1].mode == Mode.POSHOLD and abs(tank.states[1][1] - 2.0) < 0.05
 
 
 def test_straight_dock_is_begun_from_anywhere_as_the_papers() -> None:
-    tank = before_each_other(2.0, parameters=Parameters().replace("docking.approach", "straight"))
+    tank = tank_with_row(2.0, parameters=Parameters().replace("docking.approach", "straight"))
     outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
     assert [dock.stage for dock in outputs.docks] == [Stage.APPROACH] and outputs.records[1].mode == Mode.DOCK
 
 
 def test_body_whose_dock_is_over_may_dock_again() -> None:
-    tank = before_each_other(0.6)
+    tank = tank_with_row(0.6)
     outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
     assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD
     outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
@@ -101,7 +101,7 @@ def test_body_whose_dock_is_over_may_dock_again() -> None:
 @pytest.mark.parametrize("wanted", [DockRequest(2, 3, 0, 2), DockRequest(2, 2, 1, 3)], ids=["of the target", "of who docks"])
 def test_dock_to_a_face_that_another_dock_is_to_close_is_refused(wanted: DockRequest) -> None:
     """Both bodies would go to the same place and collide there."""
-    tank = before_each_other(0.6, 1.2)
+    tank = tank_with_row(0.6, 1.2)
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     outputs = tank.run(0.1, Request(Action.DOCK, 2, wanted))
     assert len(outputs.docks) == 1 and tank.when(f"dock refused: {TAKEN}")
@@ -110,7 +110,7 @@ def test_dock_to_a_face_that_another_dock_is_to_close_is_refused(wanted: DockReq
 
 def test_dock_that_would_bring_a_module_where_another_dock_brings_one_is_refused() -> None:
     """Two pairs go to two faces of one robot, and the second modules of both would end at the same place, off its corner."""
-    tank = Docked([(0, 0, 0), (-1, 0, 0), (0, 0, 0), (1, 0, 0), (0, 0, 0), (0, 1, 0)], each=2)
+    tank = FaultyTank([(0, 0, 0), (-1, 0, 0), (0, 0, 0), (1, 0, 0), (0, 0, 0), (0, 1, 0)], each=2)
     for state, (north, east) in zip(tank.states, [(1.0, 0.0), (1.2, 0.6), (1.8, 0.1)], strict=True):
         state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
@@ -123,7 +123,7 @@ def test_dock_that_would_bring_a_module_where_another_dock_brings_one_is_refused
 
 @pytest.mark.slow
 def test_dock_that_is_asked_for_twice_goes_on_and_another_takes_its_place() -> None:
-    tank = before_each_other(0.6, 1.2)
+    tank = tank_with_row(0.6, 1.2)
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     while tank.outputs[-1].docks[0].stage != Stage.APPROACH:
         tank.run(0.01)
@@ -138,7 +138,7 @@ def test_dock_that_is_asked_for_twice_goes_on_and_another_takes_its_place() -> N
 
 @pytest.mark.slow
 def test_magnets_of_every_face_that_will_meet_pull_in_a_dock_and_let_go_with_it() -> None:
-    tank = Docked(RING, each=2)
+    tank = FaultyTank(RING, each=2)
     for state, east in zip(tank.states, (0.0, 0.6), strict=True):
         state[:7] = [1.0, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
@@ -159,9 +159,9 @@ def test_magnets_of_every_face_that_will_meet_pull_in_a_dock_and_let_go_with_it(
 WANTED = Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2))
 
 
-def on_its_approach(delay: int = 0) -> Docked:
+def on_its_approach(delay: int = 0) -> FaultyTank:
     """Two modules, one of which docks to the other and is in its approach. `delay`: extra ticks that each plan takes."""
-    tank = before_each_other(0.6)
+    tank = tank_with_row(0.6)
     tank._delay = delay
     tank.run(0.02 + 0.01 * delay, WANTED)
     while tank.outputs[-1].docks[0].stage != Stage.APPROACH:
@@ -206,7 +206,7 @@ def test_dock_whose_plan_is_still_awaited_when_the_one_before_is_over_begins_all
 
 @pytest.mark.slow
 def test_dock_that_is_refused_leaves_the_one_under_way_alone() -> None:
-    tank = before_each_other(0.6)
+    tank = tank_with_row(0.6)
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
     assert tank.when("dock refused: on its way")
@@ -216,7 +216,7 @@ def test_dock_that_is_refused_leaves_the_one_under_way_alone() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("armed", [0, 1])
 def test_robot_that_docks_to_one_that_is_disarmed_is_disarmed_and_says_so(armed: int) -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0)], Parameters().replace("docking.push_m", 0.0), apart=True)
+    tank = FaultyTank([(0, 0, 0), (0, 1, 0)], Parameters().replace("docking.push_m", 0.0), apart=True)
     for state, side in zip(tank.states, (0.0, PITCH_M), strict=True):
         state[:7] = [1.0, side, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
@@ -226,12 +226,12 @@ def test_robot_that_docks_to_one_that_is_disarmed_is_disarmed_and_says_so(armed:
     dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if it had just arrived
     outputs = tank.run(2.0)
     assert tank.shape == [(0, 1)] and outputs.records[0].state == (State.ARMED if armed else State.DISARMED)
-    assert any("docked to a body that is not armed" in words for _, words in tank.said) is not bool(armed)
+    assert any("docked to a body that is not armed" in words for _, words in tank.event_log) is not bool(armed)
 
 
 @pytest.mark.slow
 def test_dock_in_whose_place_another_was_asked_for_before_it_was_planned_never_begins() -> None:
-    tank = before_each_other(0.6, 1.2)
+    tank = tank_with_row(0.6, 1.2)
     tank._delay = 50
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     tank.run(0.1, Request(Action.SET_MODE, 1, Mode.POSHOLD))
@@ -244,7 +244,7 @@ def test_dock_in_whose_place_another_was_asked_for_before_it_was_planned_never_b
 
 @pytest.mark.slow
 def test_dock_whose_plan_is_still_awaited_when_the_target_of_the_one_before_is_taken_apart_begins_all_the_same() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0)] * 3, each=2, delay=50)
+    tank = FaultyTank([(0, 0, 0), (0, 1, 0)] * 3, each=2, delay=50)
     for state, north, east in zip(tank.states, (1.0, 1.0, 3.0), (0.0, 2.4, 2.4), strict=True):
         state[:7] = [north, east, 0.8, *from_euler(0.0, 0.02, 0.0)]
     tank.run(2.0)
@@ -257,8 +257,8 @@ def test_dock_whose_plan_is_still_awaited_when_the_target_of_the_one_before_is_t
 
 
 def test_refused_dock_does_not_end_the_one_that_was_asked_for_after_it() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0)], apart=True, delay=20)
-    tank.weak = {0, 1}
+    tank = FaultyTank([(0, 0, 0), (0, 1, 0)], apart=True, delay=20)
+    tank.without_current = {0, 1}
     tank.states[1][1] = 0.6
     tank.run(2.0)
     tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))

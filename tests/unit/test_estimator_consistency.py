@@ -128,7 +128,7 @@ def fly(
     return flight
 
 
-class InOrder:
+class ReferenceFilter:
     """A textbook Kalman filter on the error state: it gets every event in the order in which it happened, nothing late.
 
     Measurement Jacobians by finite differences of its own models; the standard covariance update, (I - K H) P.
@@ -150,7 +150,7 @@ class InOrder:
     def _turn(x: np.ndarray) -> Rotation:
         return Rotation.from_quat(x[[4, 5, 6, 3]])
 
-    def move(self, tau: np.ndarray, to_ns: int) -> float:
+    def propagate(self, tau: np.ndarray, to_ns: int) -> float:
         """Propagates to `to_ns`; returns for how long, s."""
         dt = (to_ns - self.time_ns) * 1e-9
         if dt > 0.0:
@@ -175,7 +175,7 @@ class InOrder:
         self.x = propagation.inject(self.x, gain @ residual(self.x))
         self.covariance = self.covariance - gain @ (jacobian @ self.covariance + m.T)
 
-    def hear(self, measured: Measured, tau: np.ndarray, elapsed: float, whole: bool = True) -> None:
+    def fuse_inertial(self, measured: Measured, tau: np.ndarray, elapsed: float, whole: bool = True) -> None:
         """Fuses the inertial sensors and depth of one tick; for a part of a tick (not `whole`), the accelerometer alone.
 
         The acceleration by thrusters and drag is taken as known; the accelerometer measures the process noise.
@@ -199,7 +199,7 @@ class InOrder:
             shared[6 + i, i + 3 * whole] = p.accel_process**2
         self._correct(residual, noise, shared)
 
-    def see(self, tag: BodyPose) -> None:
+    def fuse_tag(self, tag: BodyPose) -> None:
         """Fuses one tag; its attitude residual, a rotation vector in the body frame, is taken at first order."""
 
         def residual(x: np.ndarray) -> np.ndarray:
@@ -211,22 +211,22 @@ class InOrder:
         self._correct(residual, np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3]) ** 2)
 
 
-def in_order(body: Body, flight: Flight, p: Estimation = P) -> InOrder:
+def in_order(body: Body, flight: Flight, p: Estimation = P) -> ReferenceFilter:
     """The reference filter, run over all tags that arrived by the end, stopped at the newest of them."""
     tags = sorted((tag for measured in flight.measured for tag in measured.tags), key=lambda tag: tag.capture_ns)
-    reference = InOrder(body, tags[0], p)
+    reference = ReferenceFilter(body, tags[0], p)
     waiting = tags[1:]
     for time_ns, tau, measured in flight.ticks():
         if time_ns <= tags[0].capture_ns:
             continue
         while waiting and waiting[0].capture_ns < time_ns:
-            reference.hear(measured, tau, reference.move(tau, waiting[0].capture_ns), whole=False)
-            reference.see(waiting.pop(0))
+            reference.fuse_inertial(measured, tau, reference.propagate(tau, waiting[0].capture_ns), whole=False)
+            reference.fuse_tag(waiting.pop(0))
         if not waiting:
             return reference
-        reference.hear(measured, tau, reference.move(tau, time_ns))
+        reference.fuse_inertial(measured, tau, reference.propagate(tau, time_ns))
         while waiting and waiting[0].capture_ns == time_ns:
-            reference.see(waiting.pop(0))
+            reference.fuse_tag(waiting.pop(0))
         if not waiting:
             return reference
     raise AssertionError("a tag was left over")

@@ -14,7 +14,7 @@ LOSS, REPEAT, LATEST_TICKS = 0.15, 0.15, 10
 RESEND_TICKS = 150
 
 
-class Planner:
+class UploadingStation:
     """A station that uploads its mission by the protocol: it answers requests, and retransmits its last message while nothing arrives."""
 
     def __init__(self, world: World, client: Client, items: list[tuple[float, ...]], random: Random) -> None:
@@ -68,21 +68,22 @@ class Planner:
 def test_mission_that_is_kept_is_a_whole_one_and_who_hears_that_his_is_taken_brought_it(seed: int) -> None:
     random, world = Random(seed), World()
     places = [[(302084010 + 100 * n + i, 1201614010, -0.4) for i in range(random.randint(1, 8))] for n in range(2)]
-    planners = [
-        Planner(world, world.client(255 - n), [item(i, place) for i, place in enumerate(each)], random) for n, each in enumerate(places)
+    stations = [
+        UploadingStation(world, world.client(255 - n), [item(i, place) for i, place in enumerate(each)], random)
+        for n, each in enumerate(places)
     ]
     kept: list[tuple[int, ...]] = []
     for _ in range(2000):
-        for planner in planners:
-            planner.step()
+        for station in stations:
+            station.step()
         world.run(1)
         now = tuple(item.x for item in world.station.services[1].flight.items)
         if now and (not kept or now != kept[-1]):
             kept.append(now)
-        if all(planner.result is not None for planner in planners):
+        if all(station.result is not None for station in stations):
             break
     whole = [tuple(x for x, _, _ in each) for each in places]
     assert kept and all(each in whole for each in kept)
-    for planner, mission in zip(planners, whole, strict=True):
-        assert planner.result != mavlink.MAV_MISSION_ACCEPTED or mission in kept
-        assert planner.result is not None or mission in kept[:-1], "only who was taken, and then replaced, is not told any more"
+    for station, mission in zip(stations, whole, strict=True):
+        assert station.result != mavlink.MAV_MISSION_ACCEPTED or mission in kept
+        assert station.result is not None or mission in kept[:-1], "only who was taken, and then replaced, is not told any more"

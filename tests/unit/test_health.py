@@ -25,7 +25,7 @@ SINGLE = assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [1])
 ZERO = np.zeros(3)
 
 
-class Ear:
+class MonitorBench:
     """A health monitor with a clock, for modules 1 and 3 of a fleet of four."""
 
     def __init__(self, body: Body = BODY) -> None:
@@ -36,7 +36,7 @@ class Ear:
         self.dropped = 0
         self.foreign: dict[str, bool] = {}
 
-    def hear(self, one: ModuleInputs | None = None, three: ModuleInputs | None = None, *requests: Request, **more: Any) -> Health:
+    def step(self, one: ModuleInputs | None = None, three: ModuleInputs | None = None, *requests: Request, **more: Any) -> Health:
         self.tick += 1
         self.time_ns += TICK_NS
         other = more.get("others", ModuleInputs())
@@ -52,7 +52,7 @@ class Ear:
 
     def wait(self, seconds: float, **more: object) -> Health:
         for _ in range(round(seconds / 0.01)):
-            health = self.hear(**more)  # type: ignore[arg-type]
+            health = self.step(**more)  # type: ignore[arg-type]
         return health
 
 
@@ -61,253 +61,253 @@ def here(**said: object) -> ModuleInputs:
 
 
 def test_silence_is_counted_per_module() -> None:
-    ear = Ear()
-    ear.hear(here(), here())
+    bench = MonitorBench()
+    bench.step(here(), here())
     for _ in range(50):
-        health = ear.hear(here())
+        health = bench.step(here())
     assert health.silent == (3,) and health.bus_silent_s == 0.0
     assert health.silent_s == pytest.approx(0.5)
-    health = ear.wait(0.3)
+    health = bench.wait(0.3)
     assert health.silent == (1, 3) and health.bus_silent_s == pytest.approx(0.3) and health.silent_s == pytest.approx(0.8)
-    assert ear.hear(here(), here()).silent == ()
+    assert bench.step(here(), here()).silent == ()
 
 
 def test_e_stop_that_holds_a_module_of_another_body_is_heard_until_that_falls_silent_or_lets_go() -> None:
     """Modules 0 and 2 belong to other bodies, perhaps on another bus: whoever pressed the e-stop there wants everything to stop."""
-    ear = Ear()
+    bench = MonitorBench()
     stopped, free = here(mcu_state=4), here(mcu_state=1)
-    assert ear.hear(here(), here(), others=stopped).stopped == (0, 2)
-    assert ear.hear(here(), here(), others=free).stopped == ()
-    ear.hear(here(), stopped, others=stopped)
-    assert ear.wait(0.1).stopped == (0, 2, 3)
-    assert ear.wait(1.0).stopped == (3,), "its own modules are waited for; one that was switched off elsewhere holds nobody back"
+    assert bench.step(here(), here(), others=stopped).stopped == (0, 2)
+    assert bench.step(here(), here(), others=free).stopped == ()
+    bench.step(here(), stopped, others=stopped)
+    assert bench.wait(0.1).stopped == (0, 2, 3)
+    assert bench.wait(1.0).stopped == (3,), "its own modules are waited for; one that was switched off elsewhere holds nobody back"
     whole = HealthMonitor(BODY, Parameters(), TICK_NS)
-    whole.take_over([ear.monitor])
+    whole.take_over([bench.monitor])
     assert set(whole._stopped_ns) == {0, 2, 3}
 
 
 def test_module_that_starts_or_has_a_fault_is_unfit_until_it_says_otherwise() -> None:
-    ear = Ear()
-    assert ear.hear().unfit == ()
-    assert ear.hear(here(mcu_state=1), here(mcu_state=5)).unfit == (3,)
-    assert ear.hear(here(mcu_state=0), here()).unfit == (1, 3), "one that says nothing is as it was"
-    whole = Ear()
-    whole.monitor.take_over([ear.monitor])
-    assert whole.hear().unfit == (1, 3)
+    bench = MonitorBench()
+    assert bench.step().unfit == ()
+    assert bench.step(here(mcu_state=1), here(mcu_state=5)).unfit == (3,)
+    assert bench.step(here(mcu_state=0), here()).unfit == (1, 3), "one that says nothing is as it was"
+    whole = MonitorBench()
+    whole.monitor.take_over([bench.monitor])
+    assert whole.step().unfit == (1, 3)
     for state in (1, 2, 3, 4):
-        assert ear.hear(here(mcu_state=state), here(mcu_state=state)).unfit == ()
+        assert bench.step(here(mcu_state=state), here(mcu_state=state)).unfit == ()
 
 
 def test_module_that_only_talks_has_not_answered() -> None:
-    ear = Ear()
-    ear.hear(here(), here())
+    bench = MonitorBench()
+    bench.step(here(), here())
     for _ in range(30):
-        health = ear.hear(here(), ModuleInputs(heard=True))
+        health = bench.step(here(), ModuleInputs(heard=True))
     assert health.silent == (3,) and health.silent_s == 0.0
 
 
 def test_gap_between_pictures_is_told_while_they_come() -> None:
-    ear = Ear()
+    bench = MonitorBench()
 
     def see(capture_ns: int) -> float:
         seen = [TagObservation(face, 7, START_NS + capture_ns, ZERO, np.array([1.0, 0, 0, 0])) for face in (0, 5)]
-        return ear.hear(here(tags=seen), here(tags=seen)).tag_gap_s
+        return bench.step(here(tags=seen), here(tags=seen)).tag_gap_s
 
-    assert math.isnan(ear.hear(here(), here()).tag_gap_s) and math.isnan(see(0))
-    ear.wait(1.5)
+    assert math.isnan(bench.step(here(), here()).tag_gap_s) and math.isnan(see(0))
+    bench.wait(1.5)
     assert see(1_500_000_000) == 1.5
-    assert ear.wait(2.9).tag_gap_s == 1.5
-    assert math.isnan(ear.wait(0.2).tag_gap_s)
+    assert bench.wait(2.9).tag_gap_s == 1.5
+    assert math.isnan(bench.wait(0.2).tag_gap_s)
     assert see(4_600_000_000) == pytest.approx(3.1)
 
 
 def test_robot_that_just_started_is_not_long_silent() -> None:
-    health = Ear().hear()
+    health = MonitorBench().step()
     assert health.silent == (1, 3) and health.silent_s == 0.0 and health.depth_age_s == 0.0
 
 
 def test_weakest_supply_and_hottest_cabin_count() -> None:
-    ear = Ear()
-    assert math.isnan(ear.hear().voltage_share) and math.isnan(ear.hear().cabin_c)
-    health = ear.hear(here(voltage_v=12.0, cabin_temperature_c=31.0), here(voltage_v=10.8, cabin_temperature_c=40.0))
+    bench = MonitorBench()
+    assert math.isnan(bench.step().voltage_share) and math.isnan(bench.step().cabin_c)
+    health = bench.step(here(voltage_v=12.0, cabin_temperature_c=31.0), here(voltage_v=10.8, cabin_temperature_c=40.0))
     assert health.voltage_share == pytest.approx(0.9) and health.cabin_c == 40.0
     for _ in range(40):
-        health = ear.hear(here(voltage_v=6.0), here())
+        health = bench.step(here(voltage_v=6.0), here())
     assert health.voltage_share == pytest.approx(0.5, abs=0.01), "single readings are smoothed"
 
 
 def test_supply_that_sags_for_one_reading_is_not_low_and_one_that_stays_low_is_within_a_second() -> None:
-    ear = Ear()
-    ear.hear(here(voltage_v=12.0), here(voltage_v=12.0))
-    assert 0.85 < ear.hear(here(voltage_v=6.0), here(voltage_v=12.0)).voltage_share < 0.95
+    bench = MonitorBench()
+    bench.step(here(voltage_v=12.0), here(voltage_v=12.0))
+    assert 0.85 < bench.step(here(voltage_v=6.0), here(voltage_v=12.0)).voltage_share < 0.95
     for _ in range(10):
-        health = ear.hear(here(voltage_v=6.0), here(voltage_v=12.0))
+        health = bench.step(here(voltage_v=6.0), here(voltage_v=12.0))
     assert 0.5 < health.voltage_share < 0.56
 
 
 def test_readings_of_battery_and_cabin_are_as_old_as_the_module_s_that_was_silent_of_them_longest() -> None:
     """A sensor that died an hour ago indicates neither an empty battery nor a hot cabin."""
-    ear, well = Ear(), {"voltage_v": 12.0, "cabin_temperature_c": 31.0}
-    health = ear.hear(here(**well), here())
+    bench, well = MonitorBench(), {"voltage_v": 12.0, "cabin_temperature_c": 31.0}
+    health = bench.step(here(**well), here())
     assert min(health.battery_age_s, health.cabin_age_s) > NEVER_S
-    health = ear.hear(here(), here(**well))
+    health = bench.step(here(), here(**well))
     assert health.battery_age_s == health.cabin_age_s == pytest.approx(0.01)
-    health = ear.wait(2.0)
+    health = bench.wait(2.0)
     assert health.battery_age_s == health.cabin_age_s == pytest.approx(2.01)
     assert health.voltage_share == 1.0, "no fail-safe ends because its sensor is gone"
-    ear.hear(here(voltage_v=12.0), here(voltage_v=12.0))
-    whole = Ear()
-    whole.monitor.take_over([ear.monitor])
-    whole.time_ns = ear.time_ns
-    health = whole.hear()
+    bench.step(here(voltage_v=12.0), here(voltage_v=12.0))
+    whole = MonitorBench()
+    whole.monitor.take_over([bench.monitor])
+    whole.time_ns = bench.time_ns
+    health = whole.step()
     assert health.battery_age_s == pytest.approx(0.01) and health.cabin_age_s == pytest.approx(2.03)
 
 
 def test_cabin_pressure_counts_from_its_first_reading() -> None:
-    ear = Ear()
-    ear.hear(here(cabin_pressure_pa=80e3), here(cabin_pressure_pa=100e3))
-    assert ear.hear(here(cabin_pressure_pa=81e3), here(cabin_pressure_pa=93e3)).cabin_change_pa == 7e3
-    whole = Ear()
-    whole.monitor.take_over([ear.monitor])
-    assert whole.hear(here(), here(cabin_pressure_pa=90e3)).cabin_change_pa == 10e3, "also of a body that is made of others"
+    bench = MonitorBench()
+    bench.step(here(cabin_pressure_pa=80e3), here(cabin_pressure_pa=100e3))
+    assert bench.step(here(cabin_pressure_pa=81e3), here(cabin_pressure_pa=93e3)).cabin_change_pa == 7e3
+    whole = MonitorBench()
+    whole.monitor.take_over([bench.monitor])
+    assert whole.step(here(), here(cabin_pressure_pa=90e3)).cabin_change_pa == 10e3, "also of a body that is made of others"
 
 
 def test_cabin_that_was_wet_twice_is_not_dry_at_once_for_a_body_that_is_made_of_others() -> None:
-    ear, whole = Ear(), Ear()
+    bench, whole = MonitorBench(), MonitorBench()
     for _ in range(2):
-        ear.hear(here(leak=True), here())
-    whole.monitor.take_over([ear.monitor])
-    whole.time_ns = ear.time_ns
-    assert whole.hear(here(leak=False), here()).leak
+        bench.step(here(leak=True), here())
+    whole.monitor.take_over([bench.monitor])
+    whole.time_ns = bench.time_ns
+    assert whole.step(here(leak=False), here()).leak
 
 
 def test_leak_of_any_module_counts_until_it_says_dry() -> None:
-    ear = Ear()
-    assert ear.hear(here(leak=True), here(leak=False)).leak and not ear.hear(here(leak=False), here()).leak
-    assert ear.hear(here(), here(leak=True)).leak and ear.hear(here(leak=False), here()).leak
-    assert not ear.hear(here(), here(leak=False)).leak, "one reading alone is none for long"
-    ear.hear(here(), here(leak=True)), ear.hear(here(), here(leak=True))
-    assert ear.wait(2.98).leak and ear.hear(here(), here(leak=False)).leak, "water in a cabin moves"
-    assert not ear.hear(here(), here(leak=False)).leak
+    bench = MonitorBench()
+    assert bench.step(here(leak=True), here(leak=False)).leak and not bench.step(here(leak=False), here()).leak
+    assert bench.step(here(), here(leak=True)).leak and bench.step(here(leak=False), here()).leak
+    assert not bench.step(here(), here(leak=False)).leak, "one reading alone is none for long"
+    bench.step(here(), here(leak=True)), bench.step(here(), here(leak=True))
+    assert bench.wait(2.98).leak and bench.step(here(), here(leak=False)).leak, "water in a cabin moves"
+    assert not bench.step(here(), here(leak=False)).leak
 
 
 def test_wet_sensor_that_flickers_is_a_leak_all_the_time() -> None:
-    ear = Ear()
-    ear.hear(here(leak=True))
-    assert all(ear.hear(here(leak=tick % 290 < 2)).leak for tick in range(3000))
+    bench = MonitorBench()
+    bench.step(here(leak=True))
+    assert all(bench.step(here(leak=tick % 290 < 2)).leak for tick in range(3000))
 
 
 def test_body_that_takes_over_knows_what_its_modules_said_and_when_people_were_heard() -> None:
     """Taken over by a body of module 3 alone, and then by the pair again."""
-    whole = Ear()
+    whole = MonitorBench()
     sticks = Request(Action.STICKS, 0, Sticks((0.5, 0.0, 0.0)))
     whole.dropped = 1000
     said = {"voltage_v": 11.4, "cabin_temperature_c": 44.0, "pressure_pa": 1.2e5, "esc": [EscFeedback(6, (0.0, 0.0), (0.0, 0.0), (0, 0))]}
-    whole.hear(here(cabin_pressure_pa=90e3), here(cabin_pressure_pa=100e3), Request(Action.GROUND_ALIVE, 0), sticks)
-    whole.hear(here(leak=True), here(cabin_pressure_pa=93e3, **said))
+    whole.step(here(cabin_pressure_pa=90e3), here(cabin_pressure_pa=100e3), Request(Action.GROUND_ALIVE, 0), sticks)
+    whole.step(here(leak=True), here(cabin_pressure_pa=93e3, **said))
     before = whole.wait(0.5)
-    alone = Ear(assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [3]))
+    alone = MonitorBench(assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [3]))
     alone.monitor.take_over([whole.monitor])
     alone.tick, alone.time_ns, alone.dropped = whole.tick, whole.time_ns, whole.dropped
-    after = alone.hear()
+    after = alone.step()
     assert (after.cabin_change_pa, after.cabin_c, after.leak, after.silent) == (7e3, 44.0, False, (3,))
     assert after.voltage_share == pytest.approx(0.95)
     assert after.silent_s == after.depth_age_s == pytest.approx(0.51)
     assert after.ground_age_s == after.pilot_age_s == pytest.approx(0.52) and after.stick == 0.5
     assert 6 not in after.esc_missing and 5 in after.esc_missing
     assert after.frame_errors_per_s == pytest.approx(before.frame_errors_per_s, rel=0.02), "no frame counts twice"
-    pair = Ear()
+    pair = MonitorBench()
     pair.monitor.take_over([whole.monitor, alone.monitor])
     pair.tick, pair.time_ns, pair.dropped = alone.tick, alone.time_ns, alone.dropped
-    assert pair.hear().leak and pair.hear().cabin_change_pa == 7e3
+    assert pair.step().leak and pair.step().cabin_change_pa == 7e3
 
 
 def test_joined_body_knows_of_the_ticks_that_were_missed_before() -> None:
-    ear, both = Ear(), Ear()
-    ear.hear()
-    ear.time_ns += 20 * TICK_NS
-    missed = ear.hear().missed_ticks_per_s
-    both.monitor.take_over([ear.monitor, Ear().monitor])
-    both.time_ns = ear.time_ns
-    assert both.hear().missed_ticks_per_s == pytest.approx(missed, rel=0.02) == pytest.approx(20.0, rel=0.02)
+    bench, both = MonitorBench(), MonitorBench()
+    bench.step()
+    bench.time_ns += 20 * TICK_NS
+    missed = bench.step().missed_ticks_per_s
+    both.monitor.take_over([bench.monitor, MonitorBench().monitor])
+    both.time_ns = bench.time_ns
+    assert both.step().missed_ticks_per_s == pytest.approx(missed, rel=0.02) == pytest.approx(20.0, rel=0.02)
 
 
 def test_fence_and_delays_may_change() -> None:
-    ear = Ear()
-    ear.monitor.retune(Parameters().replace("fence.north_m", 0.25).replace("supervision.answer_ms", 1000.0))
-    ear.hear(here(), here())
-    health = ear.wait(0.5)
+    bench = MonitorBench()
+    bench.monitor.retune(Parameters().replace("fence.north_m", 0.25).replace("supervision.answer_ms", 1000.0))
+    bench.step(here(), here())
+    health = bench.wait(0.5)
     assert health.outside_m == 0.75 and health.silent == ()
 
 
 def test_esc_that_fails_or_falls_silent_is_missing() -> None:
-    ear = Ear()
-    assert ear.hear().esc_missing == tuple(range(16))
+    bench = MonitorBench()
+    assert bench.step().esc_missing == tuple(range(16))
     good = [EscFeedback(i, (0.0, 0.0), (0.0, 0.0), (0, 2)) for i in range(0, 8, 2)]
     bad = [*good[:3], EscFeedback(6, (0.0, 0.0), (0.0, 0.0), (1, 3))]
-    assert ear.hear(here(esc=good), here(esc=bad)).esc_missing == (14, 15)
-    assert ear.wait(1.0).esc_missing == (14, 15)
-    assert ear.hear().esc_missing == tuple(range(16))
+    assert bench.step(here(esc=good), here(esc=bad)).esc_missing == (14, 15)
+    assert bench.wait(1.0).esc_missing == (14, 15)
+    assert bench.step().esc_missing == tuple(range(16))
 
 
 def test_ground_station_and_pilot_count_once_they_were_heard() -> None:
-    ear = Ear()
-    health = ear.wait(5.0)
+    bench = MonitorBench()
+    health = bench.wait(5.0)
     assert math.isnan(health.ground_age_s) and math.isnan(health.pilot_age_s)
-    ear.hear(None, None, Request(Action.GROUND_ALIVE), Request(Action.STICKS, 1, Sticks((0.0, -0.4, 0.1), (0.0, 0.2, 0.0))))
-    health = ear.wait(0.5)
+    bench.step(None, None, Request(Action.GROUND_ALIVE), Request(Action.STICKS, 1, Sticks((0.0, -0.4, 0.1), (0.0, 0.2, 0.0))))
+    health = bench.wait(0.5)
     assert health.ground_age_s == health.pilot_age_s == pytest.approx(0.5) and health.stick == 0.4
 
 
 def test_bad_frames_and_missed_ticks_are_rates() -> None:
-    ear = Ear()
+    bench = MonitorBench()
     for _ in range(300):
-        ear.dropped += 1
-        health = ear.hear()
+        bench.dropped += 1
+        health = bench.step()
     assert health.frame_errors_per_s == pytest.approx(100.0, rel=0.06) and health.missed_ticks_per_s == 0.0
     for _ in range(100):
-        ear.time_ns += TICK_NS
-        health = ear.hear()
+        bench.time_ns += TICK_NS
+        health = bench.step()
     assert health.missed_ticks_per_s == pytest.approx(50.0, rel=0.2)
 
 
 def test_innovations_and_refusals_are_means_of_a_second() -> None:
-    ear = Ear()
-    assert ear.hear().nis_ratio == pytest.approx(1.0)
+    bench = MonitorBench()
+    assert bench.step().nis_ratio == pytest.approx(1.0)
     for _ in range(60):
-        health = ear.hear(nis=30.0)  # type: ignore[arg-type]
+        health = bench.step(nis=30.0)  # type: ignore[arg-type]
     assert health.nis_ratio == pytest.approx(1.0 + 4.0 * (1.0 - math.exp(-1.0)), rel=0.01), "a second of tags"
     for _ in range(240):
-        health = ear.hear(nis=30.0)  # type: ignore[arg-type]
+        health = bench.step(nis=30.0)  # type: ignore[arg-type]
     assert health.nis_ratio == pytest.approx(5.0, rel=0.02)
-    health = ear.wait(1.0, nis=math.nan, nis_dof=0)
+    health = bench.wait(1.0, nis=math.nan, nis_dof=0)
     assert health.nis_ratio == pytest.approx(5.0, rel=0.02), "no tag says nothing"
     for n in range(1, 300):
-        health = ear.hear(rejected=n, nis=math.nan, nis_dof=0)  # type: ignore[arg-type]
+        health = bench.step(rejected=n, nis=math.nan, nis_dof=0)  # type: ignore[arg-type]
     assert 0.98 < health.rejected_share <= 1.0
 
 
 def test_tags_that_the_papers_estimator_accepts_count_though_it_tells_no_innovations() -> None:
     """A newer tag in a tick without a refusal counts as accepted; no tag in a tick says nothing, as with the other estimator."""
-    ear = Ear()
+    bench = MonitorBench()
     silence = {"nis": math.nan, "nis_dof": 0}
     for n in range(1, 301):
-        ear.hear(rejected=n, tag_age_ns=n * TICK_NS, **silence)  # type: ignore[arg-type]
+        bench.step(rejected=n, tag_age_ns=n * TICK_NS, **silence)  # type: ignore[arg-type]
     for n in range(301, 401):
-        health = ear.hear(rejected=300, tag_age_ns=n * TICK_NS, **silence)  # type: ignore[arg-type]
+        health = bench.step(rejected=300, tag_age_ns=n * TICK_NS, **silence)  # type: ignore[arg-type]
     assert 0.98 < health.rejected_share <= 1.0
-    health = ear.wait(6.0, rejected=300, **silence)
+    health = bench.wait(6.0, rejected=300, **silence)
     assert health.rejected_share < 0.01 and health.nis_ratio == 1.0
 
 
 def test_few_flips_in_a_long_flight_of_the_papers_estimator_stay_few() -> None:
-    estimator, ear = TagOnlyEstimator(BODY, Parameters().estimation, TICK_NS), Ear()
+    estimator, bench = TagOnlyEstimator(BODY, Parameters().estimation, TICK_NS), MonitorBench()
     flip, worst = exp(np.array([0.8, 0.0, 0.0])), 0.0
     for k in range(1, 3001):
         q_wb = flip if k % 50 == 0 else np.array([1.0, 0.0, 0.0, 0.0])
         pose = BodyPose(k * TICK_NS, np.zeros(3), np.zeros(3), q_wb, 1.0)
         estimate = estimator.step(k * TICK_NS, Measured(None, None, None, [pose]), np.zeros(6))
-        worst = max(worst, ear.hear(**estimate._asdict()).rejected_share)
+        worst = max(worst, bench.step(**estimate._asdict()).rejected_share)
     assert estimate.rejected == 60 and 0.01 < worst < 0.05
 
 
@@ -322,107 +322,107 @@ def test_fence_is_a_box() -> None:
 
 
 def test_robot_without_a_pose_is_nowhere() -> None:
-    health = Ear().hear(ready=False, tag_age_ns=1 << 60)  # type: ignore[arg-type]
+    health = MonitorBench().step(ready=False, tag_age_ns=1 << 60)  # type: ignore[arg-type]
     assert math.isnan(health.outside_m) and not health.ready and health.tag_age_s > NEVER_S
-    health = Ear().hear()
+    health = MonitorBench().step()
     assert health.sigma_m == 0.03 and health.tag_age_s == pytest.approx(0.03)
 
 
 def test_depth_is_known_from_the_first_that_is_heard() -> None:
-    ear = Ear()
-    assert not ear.hear(here()).depth_heard
-    assert ear.hear(here(pressure_pa=1.1e5)).depth_heard and ear.hear(here()).depth_heard
-    whole = Ear()
-    whole.monitor.take_over([HealthMonitor(BODY, Parameters(), TICK_NS), ear.monitor])
-    assert whole.hear().depth_heard
+    bench = MonitorBench()
+    assert not bench.step(here()).depth_heard
+    assert bench.step(here(pressure_pa=1.1e5)).depth_heard and bench.step(here()).depth_heard
+    whole = MonitorBench()
+    whole.monitor.take_over([HealthMonitor(BODY, Parameters(), TICK_NS), bench.monitor])
+    assert whole.step().depth_heard
 
 
 def test_imu_is_as_old_as_its_last_sample_that_was_believed() -> None:
-    ear = Ear()
-    assert ear.wait(0.5).imu_age_s == 0.0
-    ear.monitor.imu_heard = False
-    assert ear.wait(0.3).imu_age_s == pytest.approx(0.3)
-    ear.monitor.imu_heard = True
-    assert ear.hear().imu_age_s == 0.0
+    bench = MonitorBench()
+    assert bench.wait(0.5).imu_age_s == 0.0
+    bench.monitor.imu_heard = False
+    assert bench.wait(0.3).imu_age_s == pytest.approx(0.3)
+    bench.monitor.imu_heard = True
+    assert bench.step().imu_age_s == 0.0
 
 
 def test_robot_that_stands_by_gravity_alone_is_nowhere_but_ready() -> None:
-    health = Ear().hear(tag_age_ns=1 << 60)  # type: ignore[arg-type]
+    health = MonitorBench().step(tag_age_ns=1 << 60)  # type: ignore[arg-type]
     assert health.ready and not health.placed and math.isnan(health.outside_m)
-    assert Ear().hear().placed and not Ear().hear(ready=False).placed  # type: ignore[arg-type]
+    assert MonitorBench().step().placed and not MonitorBench().step(ready=False).placed  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("foreign", ["foreign_sync", "foreign_command"])
 def test_frame_of_somebody_else_is_remembered_for_a_second(foreign: str) -> None:
-    ear = Ear()
-    assert not getattr(ear.hear(), foreign)
-    ear.foreign = {foreign: True}
-    assert getattr(ear.hear(), foreign)
-    ear.foreign = {}
-    assert [getattr(ear.hear(), foreign) for _ in range(101)] == [True] * 100 + [False]
+    bench = MonitorBench()
+    assert not getattr(bench.step(), foreign)
+    bench.foreign = {foreign: True}
+    assert getattr(bench.step(), foreign)
+    bench.foreign = {}
+    assert [getattr(bench.step(), foreign) for _ in range(101)] == [True] * 100 + [False]
 
 
 @pytest.mark.parametrize("foreign", ["foreign_sync", "foreign_command"])
 def test_joined_body_remembers_a_frame_of_somebody_else_that_one_of_its_parts_heard(foreign: str) -> None:
-    one, other, both = Ear(), Ear(), Ear()
+    one, other, both = MonitorBench(), MonitorBench(), MonitorBench()
     other.foreign = {foreign: True}
-    for ear in (one, other):
-        ear.hear()
+    for bench in (one, other):
+        bench.step()
     both.monitor.take_over([one.monitor, other.monitor])
-    assert getattr(both.hear(), foreign)
+    assert getattr(both.step(), foreign)
 
 
 def test_push_is_told_as_the_current_that_would_push_so_sideways_on_the_mean_of_a_second() -> None:
     """A vertical push comes from a payload, and its effect shows in the depth."""
-    ear, current_m_s = Ear(), 0.7
+    bench, current_m_s = MonitorBench(), 0.7
     push_n = BODY.drag.mean * current_m_s**2
     force = push_n * np.array([0.6, -0.8, 0.0]) + np.array([0.0, 0.0, 50.0])
-    ear.hear()
-    assert ear.wait(1.0, force_w=force).push_m_s == pytest.approx(current_m_s * math.sqrt(1.0 - math.exp(-1.0)))
-    assert ear.wait(9.0, force_w=force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
-    assert ear.hear(force_w=-force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
+    bench.step()
+    assert bench.wait(1.0, force_w=force).push_m_s == pytest.approx(current_m_s * math.sqrt(1.0 - math.exp(-1.0)))
+    assert bench.wait(9.0, force_w=force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
+    assert bench.step(force_w=-force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
 
 
 def test_push_upon_a_body_whose_drag_is_linear_too_is_no_more_current_than_there_is() -> None:
     body, current_m_s = assemble([(0, 0, 0)], [0], [load_vehicle("bluerov2")], [1]), 0.4
-    ear, push_n = Ear(body), body.drag.mean * current_m_s**2 + body.drag.linear[:3].mean() * current_m_s
-    ear.hear()
-    assert ear.wait(9.0, force_w=np.array([push_n, 0.0, 0.0])).push_m_s == pytest.approx(current_m_s, rel=1e-3)
+    bench, push_n = MonitorBench(body), body.drag.mean * current_m_s**2 + body.drag.linear[:3].mean() * current_m_s
+    bench.step()
+    assert bench.wait(9.0, force_w=np.array([push_n, 0.0, 0.0])).push_m_s == pytest.approx(current_m_s, rel=1e-3)
 
 
 @pytest.mark.parametrize("speed_m_s", [-0.2, 0.3, 0.9])
 def test_push_upon_a_body_under_way_is_no_more_current_than_there_is(speed_m_s: float) -> None:
     """Against 0.4 m/s, a body that moves at 0.2 m/s feels twice the push of one at rest."""
-    ear, current_m_s = Ear(), 0.4
+    bench, current_m_s = MonitorBench(), 0.4
     through_m_s = speed_m_s - current_m_s
     push_n = BODY.drag.mean * (speed_m_s * abs(speed_m_s) - through_m_s * abs(through_m_s))
-    ear.hear()
-    heard = ear.wait(9.0, force_w=np.array([0.0, -push_n, 0.0]), nu=np.array([0.1, -speed_m_s, 0.0, 0.0, 0.0, 0.0]))
+    bench.step()
+    heard = bench.wait(9.0, force_w=np.array([0.0, -push_n, 0.0]), nu=np.array([0.1, -speed_m_s, 0.0, 0.0, 0.0, 0.0]))
     assert heard.push_m_s == pytest.approx(current_m_s, rel=1e-3)
 
 
 def test_push_upon_a_body_without_drag_is_no_current() -> None:
-    ear = Ear(dataclasses.replace(BODY, drag=dataclasses.replace(BODY.drag, nodes=0.0 * BODY.drag.nodes)))
-    assert ear.wait(9.0, force_w=np.array([5.0, 0.0, 0.0])).push_m_s == 0.0
+    bench = MonitorBench(dataclasses.replace(BODY, drag=dataclasses.replace(BODY.drag, nodes=0.0 * BODY.drag.nodes)))
+    assert bench.wait(9.0, force_w=np.array([5.0, 0.0, 0.0])).push_m_s == 0.0
 
 
 def test_module_that_leaves_a_large_body_feels_the_current_that_this_one_felt() -> None:
     """Regression: the module took over the force on the whole body; one that parted without tags in 0.4 m/s gave up its place."""
     row = assemble([(0, k, 0) for k in range(4)], [0] * 4, [load_vehicle("modcube")] * 4, [1, 3, 0, 2])
-    whole, part, current_m_s = Ear(row), Ear(SINGLE), 0.4
-    whole.hear()
+    whole, part, current_m_s = MonitorBench(row), MonitorBench(SINGLE), 0.4
+    whole.step()
     whole.wait(9.0, force_w=np.array([row.drag.mean * current_m_s**2, 0.0, 0.0]))
     part.monitor.take_over([whole.monitor])
     part.time_ns = whole.time_ns
-    assert part.hear(force_w=np.array([SINGLE.drag.mean * current_m_s**2, 0.0, 0.0])).push_m_s == pytest.approx(current_m_s, rel=1e-3)
+    assert part.step(force_w=np.array([SINGLE.drag.mean * current_m_s**2, 0.0, 0.0])).push_m_s == pytest.approx(current_m_s, rel=1e-3)
 
 
 def test_push_is_known_to_a_body_that_two_have_become() -> None:
-    ear, other = Ear(), Ear()
-    for each, push_n in ((ear, 3.0), (other, 8.0)):
-        each.hear()
+    bench, other = MonitorBench(), MonitorBench()
+    for each, push_n in ((bench, 3.0), (other, 8.0)):
+        each.step()
         each.wait(9.0, force_w=np.array([push_n, 0.0, 0.0]))
-    joined = Ear()
-    joined.time_ns = ear.time_ns
-    joined.monitor.take_over([ear.monitor, other.monitor])
-    assert joined.hear(force_w=np.array([8.0, 0.0, 0.0])).push_m_s == pytest.approx(math.sqrt(8.0 / BODY.drag.mean), rel=1e-3)
+    joined = MonitorBench()
+    joined.time_ns = bench.time_ns
+    joined.monitor.take_over([bench.monitor, other.monitor])
+    assert joined.step(force_w=np.array([8.0, 0.0, 0.0])).push_m_s == pytest.approx(math.sqrt(8.0 / BODY.drag.mean), rel=1e-3)

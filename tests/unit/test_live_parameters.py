@@ -10,7 +10,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.module_at_rest import PERIOD_NS, resting
-from tests.unit.tanks import RING, Docked
+from tests.unit.tanks import RING, FaultyTank
 
 
 @pytest.fixture
@@ -79,7 +79,7 @@ def test_whole_numbers_set_in_flight_are_flown_with(flying: Pipeline) -> None:
 
 
 def test_of_several_values_of_a_parameter_in_a_tick_the_last_counts() -> None:
-    tank = Docked(RING[:2])
+    tank = FaultyTank(RING[:2])
     tank.run(0.1)
     tank.run(0.01, *(Request(Action.SET_PARAMETER, 0, ("failsafes.leak_action", value)) for value in (4, 1, 4)))
     assert tank.pipeline.parameters.failsafes.leak_action == 4

@@ -6,13 +6,13 @@ import pytest
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockRequest, Mode, Request
 from firmware_py.description.parameters import Parameters
-from tests.unit.tanks import RING, Docked
+from tests.unit.tanks import RING, FaultyTank
 
 
 @pytest.mark.slow
 def test_parts_of_a_broken_body_are_as_broken_as_it_was() -> None:
     """A thruster is dead, a cabin's pressure has risen and the ground station is silent when the joint opens."""
-    tank = Docked(RING[:2])
+    tank = FaultyTank(RING[:2])
     tank.run(0.5)
     tank.run(1.0, Request(Action.GROUND_ALIVE), Request(Action.ARM))
     whole = tank.pipeline.formation.pipelines[0]
@@ -34,7 +34,7 @@ def test_parts_of_a_broken_body_are_as_broken_as_it_was() -> None:
 
 
 def test_body_that_was_prepared_with_other_gains_flies_with_those_of_now() -> None:
-    tank = Docked(RING[:2], delay=30)
+    tank = FaultyTank(RING[:2], delay=30)
     tank.fly()
     tank.lose(1)
     while not tank._plans:
@@ -48,7 +48,7 @@ def test_body_that_was_prepared_with_other_gains_flies_with_those_of_now() -> No
 @pytest.mark.slow
 def test_magnets_of_a_joint_rest_when_their_account_is_empty_and_take_power_while_they_pull() -> None:
     parameters = Parameters().replace("limiter.relay_on_s", 2.0).replace("limiter.relay_duty", 0.25)
-    tank = Docked(RING[:2], parameters)
+    tank = FaultyTank(RING[:2], parameters)
     tank.run(1.0)
     assert [magnets.power_w for magnets in tank.pipeline.formation.pipelines[0].limiter.magnets] == [6.0, 6.0]
     tank.run(3.0)
@@ -60,7 +60,7 @@ def test_magnets_of_a_joint_rest_when_their_account_is_empty_and_take_power_whil
 
 
 def test_parted_modules_magnets_keep_their_accounts() -> None:
-    tank = Docked(RING[:2], Parameters().replace("limiter.relay_on_s", 60.0).replace("limiter.relay_duty", 0.01))
+    tank = FaultyTank(RING[:2], Parameters().replace("limiter.relay_on_s", 60.0).replace("limiter.relay_duty", 0.01))
     tank.fly()
     before = [list(magnets._left_s) for magnets in tank.pipeline.formation.pipelines[0].limiter.magnets]
     tank.lose(1)
@@ -71,12 +71,12 @@ def test_parted_modules_magnets_keep_their_accounts() -> None:
 
 def test_joint_that_holds_for_a_moment_and_is_lost_again_is_parted_by_another_plan() -> None:
     """The first plan arrives while no joint is open, and is dropped."""
-    tank = Docked(RING[:2], delay=60)
+    tank = FaultyTank(RING[:2], delay=60)
     tank.fly()
     tank.lose(1)
     while not tank._plans:
         tank.run(0.01)
-    tank.weak.clear()
+    tank.without_current.clear()
     tank.hidden.clear()
     tank.run(3.0)
     assert tank.shape == [(0, 1)]
@@ -86,7 +86,7 @@ def test_joint_that_holds_for_a_moment_and_is_lost_again_is_parted_by_another_pl
 
 
 def test_disarming_a_body_in_the_tick_in_which_it_parts_reaches_both_pieces() -> None:
-    tank = Docked(RING[:2])
+    tank = FaultyTank(RING[:2])
     tank.fly()
     tank.run(0.01, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
     while tank.shape == [(0, 1)]:

@@ -35,7 +35,7 @@ def pair(
     return world
 
 
-def thrown(seed: int, **springs: float) -> World:
+def colliding_pair(seed: int, **springs: float) -> World:
     """Two turning hulls about to collide off centre: for every third seed almost face to face, else at any tilt."""
     rng = np.random.default_rng(seed)
     q, other_q = (rotations.normalise(rng.standard_normal(4)) for _ in range(2))
@@ -52,7 +52,7 @@ def thrown(seed: int, **springs: float) -> World:
     return world
 
 
-def flown(world: World) -> np.ndarray:
+def energy_history(world: World) -> np.ndarray:
     """(TICKS + 1,) kinetic energy of both hulls, J: before they meet, and after each tick."""
     energy = [world.kinetic_energy().sum()]
     for _ in range(TICKS):
@@ -64,9 +64,9 @@ def flown(world: World) -> np.ndarray:
 def test_hulls_that_collide_at_any_tilt_gain_no_energy_and_keep_their_momentum() -> None:
     met = 0
     for seed in range(COLLISIONS):
-        world = thrown(seed)
+        world = colliding_pair(seed)
         momentum = world.momentum().sum(axis=0)
-        energy = flown(world)
+        energy = energy_history(world)
         assert energy.max() <= (1.0 + DAMPED) * energy[0], f"collision {seed}"
         np.testing.assert_allclose(world.momentum().sum(axis=0), momentum, rtol=0, atol=2e-6 * np.abs(momentum).max())
         met += bool(energy[-1] < 0.99 * energy[0])
@@ -77,8 +77,8 @@ def test_springs_of_hulls_give_back_what_they_took() -> None:
     """Without damping, and therefore without friction, energy is neither lost nor gained."""
     met = 0
     for seed in range(COLLISIONS):
-        world = thrown(seed, damping=0.0)
-        energy = flown(world)
+        world = colliding_pair(seed, damping=0.0)
+        energy = energy_history(world)
         assert energy.max() <= (1.0 + ELASTIC) * energy[0], f"collision {seed}"
         if not world._body_arrays.wrench.any():  # they have parted
             assert energy[-1] == pytest.approx(energy[0], rel=ELASTIC), f"collision {seed}"

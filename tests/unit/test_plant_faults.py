@@ -87,7 +87,7 @@ SINGLE = (
 )  # fmt: skip
 
 
-def broken(nodes: Nodes) -> list[object]:
+def fault_state(nodes: Nodes) -> list[object]:
     """State that the plant's faults can change, after one more tick and with the same commands to every module."""
     fly(nodes, 1)
     world, mcus = nodes.world, nodes.mcus.values()
@@ -108,9 +108,9 @@ def lasting(fault: Fault, at_s: float, until_s: float) -> Fault:
 def test_what_broke_is_whole_again_when_the_fault_is_over(fault: Fault) -> None:
     nodes = nodes_with(lasting(fault, 0.02, 0.05), scenario="dock")
     fly(nodes, 3)
-    assert broken(nodes) != broken(nodes_with(scenario="dock"))
+    assert fault_state(nodes) != fault_state(nodes_with(scenario="dock"))
     fly(nodes, 3, first=4)
-    assert broken(nodes) == broken(nodes_with(scenario="dock"))
+    assert fault_state(nodes) == fault_state(nodes_with(scenario="dock"))
 
 
 PAIRS = [pair for pair in itertools.permutations(SINGLE, 2) if len({fault.kind.split("_")[0] for fault in pair}) == 1]
@@ -120,15 +120,15 @@ PAIRS = [pair for pair in itertools.permutations(SINGLE, 2) if len({fault.kind.s
 @pytest.mark.parametrize(("first", "second"), PAIRS)
 def test_fault_that_begins_or_ends_leaves_another_one_as_it_was(first: Fault, second: Fault) -> None:
     """Whichever begins or ends first, the state is that of the faults that are on."""
-    alone = [broken(nodes_with(fault, scenario="dock")) for fault in (first, second)]
-    both = broken(nodes_with(first, second, scenario="dock"))
+    alone = [fault_state(nodes_with(fault, scenario="dock")) for fault in (first, second)]
+    both = fault_state(nodes_with(first, second, scenario="dock"))
     times = (((0.0, 0.08), (0.02, 0.05)), ((0.02, 0.05), (0.0, 0.08)), ((0.0, 0.05), (0.02, 0.08)), ((0.02, 0.08), (0.0, 0.05)))
     for mine, other in times:
         nodes = nodes_with(lasting(first, *mine), lasting(second, *other), scenario="dock")
         fly(nodes, 3)
-        assert broken(nodes) == both
+        assert fault_state(nodes) == both
         fly(nodes, 2, first=4)
-        assert broken(nodes) == alone[0 if mine[1] > other[1] else 1]
+        assert fault_state(nodes) == alone[0 if mine[1] > other[1] else 1]
 
 
 def test_two_faults_of_the_same_words_are_two() -> None:

@@ -23,7 +23,7 @@ from hil.metrics import DOCKING, SHOWN
 from hil.scenario import Scenario, Step, load_scenario, make_world, scenario_names
 from hil.scenario_rules import metric_names
 from hil.script import Script
-from tests.unit.tanks import Docked
+from tests.unit.tanks import FaultyTank
 
 FOLDER = Path(load_scenario.__code__.co_filename).parent / "scenarios"
 Load = Callable[..., Scenario]
@@ -220,7 +220,7 @@ def test_steps_after_an_undock_are_for_the_body_that_their_module_is_of_now(leav
     modules = tuple(dataclasses.replace(third.module[0], number=n, cell=np.array([n - 1, 0, 0])) for n in (1, 2, 3, 4))
     steps = Step(do="undock", module=leaves, target_module=2), Step(do="move", module=goes, duration_s=9.0)
     scenario = dataclasses.replace(third, module=modules, step=steps, task=dataclasses.replace(third.task, settle_s=2.0))
-    script, tank = DockScript(scenario, fleet_of(scenario, "virtual:chain", 100)), Docked([(n, 0, 0) for n in range(4)])
+    script, tank = DockScript(scenario, fleet_of(scenario, "virtual:chain", 100)), FaultyTank([(n, 0, 0) for n in range(4)])
     tank.run(0.5)
     asked: list[Request] = []
     while not any(request.action == Action.TRACK for request in asked):

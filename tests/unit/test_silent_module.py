@@ -12,7 +12,7 @@ TICK_NS, DT = 10_000_000, 0.01
 ZERO = np.zeros(3)
 
 
-class Pair:
+class DetectorRig:
     """Docked modules, two by default, of which a fault detector hears some."""
 
     def __init__(self, count: int = 2) -> None:
@@ -20,7 +20,7 @@ class Pair:
         self.body = assemble([(n, 0, 0) for n in range(count)], [0] * count, [cube] * count, list(range(count)))
         self.detector = FaultDetector(self.body, Faults(), TICK_NS)
 
-    def hear(self, seconds: float, *heard: int, armed: bool = True) -> list[str]:
+    def run(self, seconds: float, *heard: int, armed: bool = True) -> list[str]:
         """Runs the detector with only the modules `heard` answering; returns its messages."""
         said, n = [], self.body.thrusters.f_max.size
         modules = [ModuleInputs(heard=m in heard) for m in range(len(self.body.modules))]
@@ -39,53 +39,53 @@ class Pair:
 
 
 def test_thrusters_of_a_module_that_falls_silent_are_left_out_until_it_is_heard_again() -> None:
-    pair = Pair()
-    assert pair.hear(1.0, 0, 1) == [] == pair.hear(0.49, 0)
-    assert pair.hear(0.5, 0) == ["thrusters of silent module 1 are left out"]
-    assert pair.used == {0} and (pair.detector.now.lost_axes, pair.detector.now.dead) == (0, ()), "nothing was found about them"
-    pair.detector._lose(3, "stands still")
-    assert pair.hear(0.49, 0, 1) == [] and pair.hear(0.02, 0, 1) == ["thrusters of every module are used again"]
-    assert pair.detector.now.dead == (3,) and pair.used == {1}, "what was found meanwhile stays found"
+    rig = DetectorRig()
+    assert rig.run(1.0, 0, 1) == [] == rig.run(0.49, 0)
+    assert rig.run(0.5, 0) == ["thrusters of silent module 1 are left out"]
+    assert rig.used == {0} and (rig.detector.now.lost_axes, rig.detector.now.dead) == (0, ()), "nothing was found about them"
+    rig.detector._lose(3, "stands still")
+    assert rig.run(0.49, 0, 1) == [] and rig.run(0.02, 0, 1) == ["thrusters of every module are used again"]
+    assert rig.detector.now.dead == (3,) and rig.used == {1}, "what was found meanwhile stays found"
 
 
 def test_module_that_is_heard_now_and_then_is_left_out_once() -> None:
-    pair = Pair()
-    said = [words for _ in range(5) for words in pair.hear(0.55, 0) + pair.hear(0.05, 0, 1)]
+    rig = DetectorRig()
+    said = [words for _ in range(5) for words in rig.run(0.55, 0) + rig.run(0.05, 0, 1)]
     assert said == ["thrusters of silent module 1 are left out"]
-    assert pair.used == {0}
+    assert rig.used == {0}
 
 
 def test_module_that_falls_silent_after_all_others_is_used_blindly_and_that_is_said() -> None:
-    pair = Pair()
-    assert pair.hear(1.0, 0) == ["thrusters of silent module 1 are left out"]
-    assert pair.hear(1.0) == ["thrusters of every module are used again"] and pair.used == {0, 1}
+    rig = DetectorRig()
+    assert rig.run(1.0, 0) == ["thrusters of silent module 1 are left out"]
+    assert rig.run(1.0) == ["thrusters of every module are used again"] and rig.used == {0, 1}
 
 
 def test_thrusters_that_no_others_can_stand_in_for_are_used_blindly() -> None:
     """The bus may be broken in one direction only; if it is broken in both, the modules stop by themselves, and a fail-safe disarms."""
-    for pair, heard in ((Pair(1), ()), (Pair(2), ())):
-        assert pair.hear(1.0, *heard) == [] and pair.detector.now.dead == ()
+    for rig, heard in ((DetectorRig(1), ()), (DetectorRig(2), ())):
+        assert rig.run(1.0, *heard) == [] and rig.detector.now.dead == ()
 
 
 def test_silence_of_a_disarmed_body_leaves_nothing_out_and_what_was_left_out_is_back_when_it_disarms() -> None:
-    pair = Pair()
-    assert pair.hear(1.0, 0, armed=False) == []
-    assert pair.hear(0.02, 0) == ["thrusters of silent module 1 are left out"]
-    pair.detector.reset()
-    assert pair.detector.changed and pair.used == {0, 1}
+    rig = DetectorRig()
+    assert rig.run(1.0, 0, armed=False) == []
+    assert rig.run(0.02, 0) == ["thrusters of silent module 1 are left out"]
+    rig.detector.reset()
+    assert rig.detector.changed and rig.used == {0, 1}
 
 
 def test_module_that_was_left_out_is_used_again_once_its_body_is_disarmed() -> None:
-    pair, other = Pair(), Pair()
-    pair.hear(1.0, 0)
-    other.detector.take_over([pair.detector])
+    rig, other = DetectorRig(), DetectorRig()
+    rig.run(1.0, 0)
+    other.detector.take_over([rig.detector])
     assert other.used == {0}
-    other.hear(0.01, 0, armed=False)
+    other.run(0.01, 0, armed=False)
     assert other.used == {0, 1}
 
 
 def test_body_that_is_made_of_others_leaves_out_the_modules_that_were_silent_in_them() -> None:
-    three, pair = Pair(3), Pair(2)
-    three.hear(1.0, 0, 2)
-    pair.detector.take_over([three.detector])
-    assert pair.used == {0} and pair.hear(0.1, 0) == []
+    three, rig = DetectorRig(3), DetectorRig(2)
+    three.run(1.0, 0, 2)
+    rig.detector.take_over([three.detector])
+    assert rig.used == {0} and rig.run(0.1, 0) == []

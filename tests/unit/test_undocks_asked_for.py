@@ -12,12 +12,12 @@ from firmware_py.core.types import RELAY_PUSH, Action, DockRequest, Mode, Module
 from firmware_py.core.undocking import IN_PLACE, PULLED
 from firmware_py.description.parameters import Parameters
 from firmware_py.prepare.assembly import PITCH_M
-from tests.unit.tanks import RING, Docked, world
+from tests.unit.tanks import RING, FaultyTank, world
 
 
 @pytest.mark.parametrize("stop", ["e-stop", "DISARM", "mode"])
 def test_undock_ends_with_its_mode_and_the_joint_holds(stop: str) -> None:
-    tank = Docked(RING[:2])
+    tank = FaultyTank(RING[:2])
     tank.fly()
     tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
     assert any(2 in states for states in tank.pipeline.formation.docking.relays.states), "magnets push"
@@ -30,18 +30,18 @@ def test_undock_ends_with_its_mode_and_the_joint_holds(stop: str) -> None:
 
 
 def test_second_of_two_undocks_of_one_body_in_one_tick_is_ended_and_its_joint_holds() -> None:
-    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0)])
+    tank = FaultyTank([(0, 0, 0), (1, 0, 0), (2, 0, 0)])
     tank.fly()
     tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)), Request(Action.UNDOCK, 0, DockRequest(2, 1, 1, 0)))
     assert tank.shape == [(0,), (1, 2)]
-    assert not any("is undocked from 1" in text for _, text in tank.said)
+    assert not any("is undocked from 1" in text for _, text in tank.event_log)
     assert tank.when("undock of module 2 ended")
     assert tank.pipeline.formation.docking.relays.states == [[0] * 6, [1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]
 
 
 @pytest.mark.parametrize(("body", "refused"), [(0, DockRequest(2, 1, 0, 0)), (0, DockRequest(0, 2, 3, 2))], ids=["undock", "dock"])
 def test_undock_under_way_goes_on_when_what_is_asked_for_meanwhile_is_refused(body: int, refused: DockRequest) -> None:
-    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0), (4, 0, 0)], each=3)
+    tank = FaultyTank([(0, 0, 0), (1, 0, 0), (2, 0, 0), (4, 0, 0)], each=3)
     tank.fly()
     tank.run(0.3, Request(Action.UNDOCK, body, DockRequest(2, 1, 1, 0)))
     tank.run(2.0, Request(Action.UNDOCK if refused.target_module < 3 else Action.DOCK, body, refused))
@@ -52,7 +52,7 @@ def test_undock_under_way_goes_on_when_what_is_asked_for_meanwhile_is_refused(bo
 @pytest.mark.parametrize(("ahead", "behind", "glides"), [(False, False, 1), (True, False, 0), (False, True, 1), (True, True, None)])
 def test_what_is_undocked_glides_to_no_third_body(ahead: bool, behind: bool, glides: int | None) -> None:
     """When a chain of three was taken apart, the middle one once glided away from the last and pressed against the first."""
-    tank = Docked([(0, 0, 0), (1, 0, 0)] * 3, each=2)
+    tank = FaultyTank([(0, 0, 0), (1, 0, 0)] * 3, each=2)
     standoff_m = Parameters().docking.standoff_m
     along_w = world(tank.states[0]).apply([2.0 * PITCH_M + standoff_m, 0.0, 0.0])
     for n, is_there, way in (1, ahead, 1.0), (2, behind, -1.0):
@@ -71,7 +71,7 @@ def test_what_is_undocked_glides_to_no_third_body(ahead: bool, behind: bool, gli
 
 @pytest.mark.slow
 def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> None:
-    tank = Docked(RING)
+    tank = FaultyTank(RING)
     tank.fly()
     tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
     assert [sum(state == 2 for state in states) for states in tank.pipeline.formation.docking.relays.states] == [0, 1, 1, 2]
@@ -85,9 +85,9 @@ def test_corner_of_a_ring_is_undocked_by_both_its_joints_and_leaves_across() -> 
 @pytest.mark.parametrize("hung", [{2, 3}, {1, 3}, {2}, {3}], ids=str)
 def test_corner_of_a_ring_stays_where_the_relays_of_a_joint_hang(hung: set[int]) -> None:
     """Funnels hold back a module that leaves diagonally, so pictures prove nothing; but currents of a held joint do not change sign."""
-    tank = Docked(RING)
+    tank = FaultyTank(RING)
     tank.fly()
-    tank.hung, tank.stuck = hung, True
+    tank.always_pulling, tank.stuck = hung, True
     outputs = tank.run(2.5, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
     if len(hung) == 1:  # the other magnet pushes as hard as this one pulls
         assert tank.shape == [(0, 1, 2), (3,)]
@@ -100,18 +100,18 @@ def test_corner_of_a_ring_stays_where_the_relays_of_a_joint_hang(hung: set[int])
 
 def test_corner_of_a_ring_whose_hanging_relays_have_nothing_before_them_any_more_is_undocked() -> None:
     """Their currents keep their sign but are as low as those of idle coils. So are all others, hence the fail-safe is switched off."""
-    tank = Docked(RING, Parameters().replace("failsafes.partner_lost_action", 0))
+    tank = FaultyTank(RING, Parameters().replace("failsafes.partner_lost_action", 0))
     tank.fly()
-    tank.hung, tank.stuck, tank.pull_ma = {2, 3}, True, 40.0
+    tank.always_pulling, tank.stuck, tank.pull_ma = {2, 3}, True, 40.0
     tank.run(2.5, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
     assert tank.shape == [(0, 1, 2), (3,)]
 
 
 @pytest.mark.parametrize("hung", [set(), {0, 1}], ids=str)
 def test_module_out_of_sight_is_undocked_unless_its_magnets_go_on_pulling(hung: set[int]) -> None:
-    tank = Docked(RING[:2])
+    tank = FaultyTank(RING[:2])
     tank.fly()
-    tank.hidden, tank.hung = {1}, hung
+    tank.hidden, tank.always_pulling = {1}, hung
     tank.run(2.5, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
     assert tank.shape == ([(0, 1)] if hung else [(0,), (1,)])
     pushed_s = (tank.when("undock of module 1 ended") if hung else tank.when("module 1 is undocked")) - tank.when("undocking module 1")
@@ -120,9 +120,9 @@ def test_module_out_of_sight_is_undocked_unless_its_magnets_go_on_pulling(hung: 
 
 @pytest.mark.parametrize("hung", [set(), {2, 3}], ids=str)
 def test_push_shorter_than_currents_need_tells_a_corner_that_leaves_from_one_that_hanging_relays_hold(hung: set[int]) -> None:
-    tank = Docked(RING, Parameters().replace("docking.release_s", 0.01))
+    tank = FaultyTank(RING, Parameters().replace("docking.release_s", 0.01))
     tank.fly()
-    tank.hung, tank.stuck = hung, True
+    tank.always_pulling, tank.stuck = hung, True
     tank.run(1.0, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)))
     assert tank.shape == ([(0, 1, 2, 3)] if hung else [(0, 1, 2), (3,)])
 
@@ -130,16 +130,16 @@ def test_push_shorter_than_currents_need_tells_a_corner_that_leaves_from_one_tha
 @pytest.mark.parametrize("stuck", [False, True])
 def test_push_shorter_than_pictures_need_tells_a_module_that_leaves_from_one_that_is_jammed(stuck: bool) -> None:
     """For a single joint, a picture proves more than currents and is waited for: a jammed module stays although both magnets push."""
-    tank = Docked(RING[:2], Parameters().replace("docking.release_s", 0.01))
+    tank = FaultyTank(RING[:2], Parameters().replace("docking.release_s", 0.01))
     tank.fly()
     tank.stuck = stuck
     tank.run(1.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
     assert tank.shape == ([(0, 1)] if stuck else [(0,), (1,)])
-    assert any(IN_PLACE in said for _, said in tank.said) == stuck
+    assert any(IN_PLACE in said for _, said in tank.event_log) == stuck
 
 
 def test_corner_whose_currents_do_not_come_is_undocked_in_the_end() -> None:
-    tank = Docked(RING, Parameters().replace("docking.release_s", 0.01))
+    tank = FaultyTank(RING, Parameters().replace("docking.release_s", 0.01))
     tank.fly()
     hear, tank.stuck = tank._hear, True
 
@@ -152,7 +152,7 @@ def test_corner_whose_currents_do_not_come_is_undocked_in_the_end() -> None:
 
 
 def test_magnets_that_push_one_body_apart_push_on_while_another_parts() -> None:
-    tank = Docked([(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)], each=2)
+    tank = FaultyTank([(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)], each=2)
     tank.fly()
     tank.run(0.5, Request(Action.ARM, 2))
     tank.run(0.3, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
@@ -165,7 +165,7 @@ def test_magnets_that_push_one_body_apart_push_on_while_another_parts() -> None:
 
 def test_two_corners_of_a_ring_undocked_at_once_leave_no_magnet_on_between_them() -> None:
     """The first undock ends the second, having opened one of its two joints: magnets left on there would pull module 3 back."""
-    tank = Docked(RING)
+    tank = FaultyTank(RING)
     tank.fly()
     tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)), Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
     assert tank.shape == [(0, 1, 2), (3,)] and tank.when("undock of module 1 ended")
@@ -173,7 +173,7 @@ def test_two_corners_of_a_ring_undocked_at_once_leave_no_magnet_on_between_them(
 
 
 def test_undock_that_ends_in_the_tick_of_a_join_is_not_said_to_be_done() -> None:
-    tank = Docked([(0, 0, 0), (0, 1, 0), (0, 2, 0)], Parameters().replace("docking.push_m", 0.0))
+    tank = FaultyTank([(0, 0, 0), (0, 1, 0), (0, 2, 0)], Parameters().replace("docking.push_m", 0.0))
     tank.fly()
     stage = tank.pipeline.formation.docking
     tank.run(0.1, Request(Action.UNDOCK, 0, DockRequest(1, 3, 0, 2)))

@@ -20,7 +20,7 @@ REARM = Parameters(supervision=Supervision(rearm=1))
 HOLDS = "the process before ended in flight: holding as soon as the vehicle may (REARM)"
 
 
-def in_flight(tmp_path: Path, more: str = "", modules: tuple[Module, ...] = FLEET.module) -> Fleet:
+def write_log_killed_in_flight(tmp_path: Path, more: str = "", modules: tuple[Module, ...] = FLEET.module) -> Fleet:
     """Writes the log of a process that was killed in flight just now; returns the fleet."""
     tmp_path.joinpath("log").mkdir()
     Recorder(tmp_path / "log", {"boot": boot_id()}).close()
@@ -30,7 +30,7 @@ def in_flight(tmp_path: Path, more: str = "", modules: tuple[Module, ...] = FLEE
 
 @pytest.mark.slow
 def test_process_killed_in_flight_holds_again_where_a_parameter_says_so(tmp_path: Path) -> None:
-    fleet = in_flight(tmp_path)
+    fleet = write_log_killed_in_flight(tmp_path)
     assert HOLDS in fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet)
     assert (tmp_path / "log" / "0002" / CAN_LOG).exists()
     assert HOLDS not in fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet)  # 0002 ended disarmed
@@ -38,7 +38,7 @@ def test_process_killed_in_flight_holds_again_where_a_parameter_says_so(tmp_path
 
 @pytest.mark.slow
 def test_process_killed_in_flight_waits_to_be_armed_otherwise(tmp_path: Path) -> None:
-    fleet = in_flight(tmp_path)
+    fleet = write_log_killed_in_flight(tmp_path)
     assert HOLDS not in fly(tmp_path, None, parameters=REARM, fleet=fleet)
     assert HOLDS not in fly(tmp_path, tmp_path / "log", fleet=fleet)
 
@@ -62,7 +62,7 @@ def docked(first: int, second: int) -> tuple[Module, ...]:
 @pytest.mark.slow
 @pytest.mark.parametrize("parameters", [REARM, Parameters()])
 def test_modules_that_docked_in_flight_are_named_and_not_armed_again(tmp_path: Path, parameters: Parameters) -> None:
-    said = fly(tmp_path, tmp_path / "log", parameters=parameters, fleet=in_flight(tmp_path, PAIR))
+    said = fly(tmp_path, tmp_path / "log", parameters=parameters, fleet=write_log_killed_in_flight(tmp_path, PAIR))
     assert said[0] == APART.format(bus=bus_of(tmp_path))
     assert HOLDS not in said
     assert any(line.startswith("running at") for line in said)  # the start is not refused
@@ -70,13 +70,13 @@ def test_modules_that_docked_in_flight_are_named_and_not_armed_again(tmp_path: P
 
 @pytest.mark.slow
 def test_modules_that_the_fleet_file_has_docked_hold_again(tmp_path: Path) -> None:
-    said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, PAIR, docked(0, 1)))
+    said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=write_log_killed_in_flight(tmp_path, PAIR, docked(0, 1)))
     assert said[0] == HOLDS
 
 
 @pytest.mark.slow
 def test_dock_at_another_face_than_the_fleet_files_is_none_of_its_joints(tmp_path: Path) -> None:
-    said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, PAIR, docked(1, 0)))
+    said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=write_log_killed_in_flight(tmp_path, PAIR, docked(1, 0)))
     assert said[0] == APART.format(bus=bus_of(tmp_path))
     assert HOLDS not in said
 
@@ -96,7 +96,7 @@ def test_modules_that_were_undocked_in_flight_are_named_and_not_armed_as_one(
         return Operator(rate_hz, modules, *others)
 
     monkeypatch.setattr(vehicle, "Operator", operator)
-    fleet = in_flight(tmp_path, PAIR + UNDOCKED, docked(0, 1))
+    fleet = write_log_killed_in_flight(tmp_path, PAIR + UNDOCKED, docked(0, 1))
     said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet, hold=hold)
     bus = bus_of(tmp_path)
     assert said[0].startswith(f"warning: modules 1 on {bus}, 2 on {bus} were told to let go of joints that the fleet file has: ")
@@ -109,4 +109,4 @@ def test_modules_that_were_undocked_in_flight_are_named_and_not_armed_as_one(
 
 @pytest.mark.slow
 def test_relays_of_single_modules_are_no_undock(tmp_path: Path) -> None:
-    assert fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=in_flight(tmp_path, UNDOCKED))[0] == HOLDS
+    assert fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=write_log_killed_in_flight(tmp_path, UNDOCKED))[0] == HOLDS

@@ -34,7 +34,7 @@ OLD_NS = 1_000_000_000 * 86_400
 Told = tuple[State, list[Request]]
 
 
-def stopped(folder: Path, *told: Told, before: bool = False) -> None:
+def write_killed_log(folder: Path, *told: Told, before: bool = False) -> None:
     """Writes the log of a process that was then killed. `told`: its body's state and the requests, per tick; `before`: an e-stop stood."""
     log = make_log_folder(folder)
     recorder = Recorder(log, {})
@@ -71,7 +71,7 @@ CLEAR = [Request(Action.CLEAR_ESTOP)]
     ids=["disarmed", "stopped", "clearing-refused", "cleared", "stopped-again"],
 )
 def test_order_to_hold_arms_nobody_after_a_stop_that_was_not_cleared(tmp_path: Path, told: list[Told], arms: bool) -> None:
-    stopped(tmp_path, *told)
+    write_killed_log(tmp_path, *told)
     said: list[str] = []
     firmware = compose(single(), Parameters())
     before = last_flight(tmp_path, firmware.fleet, firmware.codec, 2 * OLD_NS, boot_id())
@@ -84,14 +84,14 @@ def test_order_to_hold_arms_nobody_after_a_stop_that_was_not_cleared(tmp_path: P
     [((State.DISARMED, []), True), ((State.DISARMED, CLEAR), False), ((State.ARMED, []), False)], ids=["nothing", "cleared", "armed"],
 )  # fmt: skip
 def test_stop_outlives_every_restart_until_a_person_clears_it_or_arms(tmp_path: Path, told: Told, stands: bool) -> None:
-    stopped(tmp_path, (State.ESTOP, []))
-    stopped(tmp_path, (State.DISARMED, []), told, (State.DISARMED, []), before=True)
+    write_killed_log(tmp_path, (State.ESTOP, []))
+    write_killed_log(tmp_path, (State.DISARMED, []), told, (State.DISARMED, []), before=True)
     make_log_folder(tmp_path)  # of a process that ran no tick
     assert last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped == stands
 
 
 def test_stop_is_known_however_spoilt_the_log_is_in_which_it_came(tmp_path: Path) -> None:
-    stopped(tmp_path, (State.ARMED, []), (State.ESTOP, []))
+    write_killed_log(tmp_path, (State.ARMED, []), (State.ESTOP, []))
     for name in LOGS:
         (tmp_path / name).write_bytes(b"\xff" * 2000)
     assert last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped
@@ -100,7 +100,7 @@ def test_stop_is_known_however_spoilt_the_log_is_in_which_it_came(tmp_path: Path
 def test_person_without_a_ground_station_clears_a_stop_by_hand(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    stopped(tmp_path, (State.ESTOP, []))
+    write_killed_log(tmp_path, (State.ESTOP, []))
     for said in ("the e-stop is cleared; modcube run arms by --hold and REARM from its next start on", "no e-stop stands; nothing to do"):
         monkeypatch.setattr("sys.argv", ["modcube", "clear-estop", str(tmp_path)])
         with pytest.raises(SystemExit) as ended:
@@ -125,7 +125,7 @@ def test_folder_in_which_no_vehicle_logged_has_no_stop_to_clear(
 
 @pytest.mark.slow
 def test_process_started_anew_after_a_stop_holds_nothing_and_says_so(tmp_path: Path) -> None:
-    stopped(tmp_path / "log", (State.ESTOP, []))
+    write_killed_log(tmp_path / "log", (State.ESTOP, []))
     for _ in range(2):
         assert ARMS_NOBODY in fly(tmp_path, tmp_path / "log", hold=True)
 
