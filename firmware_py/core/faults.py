@@ -127,7 +127,9 @@ class FaultDetector:
                 self._silence[i] = other._silence[j]
                 self._mute += [i] if j in other._mute else []
                 for channel, thruster in self._thruster_at[i].items():
-                    self._obeys[thruster] = other._obeys[other._thruster_at[j][channel]]
+                    number = other._thruster_at[j][channel]
+                    self._obeys[thruster] = other._obeys[number]
+                    self._motion.inherit(thruster, other._motion, number)
         self.now = self._usable_state()
 
     def reset(self) -> None:

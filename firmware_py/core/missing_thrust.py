@@ -124,10 +124,10 @@ class MissingThrust:
             return None
         full = self._close(estimate)
         self._start_block(self._last if self._last_n == len(self._seen) else None)
+        self._judge_trial(full)
         if not (full and armed):
-            self._count, self._trial = 0, None
+            self._count = 0
             return None
-        self._judge_trial()
         return self._decide(alive)
 
     def _add(self, measured: Measured, estimate: Estimate, force_n: np.ndarray) -> None:
@@ -170,19 +170,35 @@ class MissingThrust:
         self._count += 1
         if self._count < self.parameters.lie_count:
             return None
-        base, recent = (np.nanmean(blocks[:, :6], axis=0) for blocks in (self._blocks[:BASE], self._blocks[-RECENT:]))
-        self._trial = ThrusterTrial(best, base, recent - base, self._healthy[0])
+        self._trial = self._accuse(best)
         return best
 
-    def _judge_trial(self) -> None:
+    def _accuse(self, thruster: int) -> ThrusterTrial:
+        """Begins the trial of a thruster that is being left out. It may have lost its force since the base, and is then missed no more;
+        or all along, and is then missed no more in the base either.
+        """
+        whole = ~np.isnan(self._blocks[:, 0])
+        base, recent = (self._blocks[part][whole[part]].mean(axis=0) for part in (slice(BASE), slice(-RECENT, None)))
+        wall, column, sigma = (recent - base)[:6], self._columns[thruster], self._healthy[0]
+        liar, missed = [np.zeros(6)], (base - recent)[FORCES + thruster] * column
+        share = (missed / sigma) @ (wall / sigma) / max((missed / sigma) @ (missed / sigma), 1e-12)
+        if self.parameters.lie_share <= share <= MOST:
+            liar.append(share * base[FORCES + thruster] * column)
+        return ThrusterTrial(thruster, base[:6], wall, liar, sigma)
+
+    def _judge_trial(self, full: bool) -> None:
         """Shows the latest block to the trial under way; a thruster may be acquitted so many times."""
-        verdict = None if self._trial is None else self._trial.is_innocent(self._blocks[-1, :6])
+        verdict = None if self._trial is None else self._trial.is_innocent(self._blocks[-1, :6] if full else None)
         if self._trial is None or verdict is None:
             return
         thruster, self._trial = self._trial.thruster, None
         if verdict and self._acquittals[thruster] < ACQUITTALS:
             self._acquittals[thruster] += 1
             self.acquitted = thruster
+
+    def inherit(self, thruster: int, before: MissingThrust, number: int) -> None:
+        """Takes over how often `thruster` was acquitted, as number `number` of the body before."""
+        self._acquittals[thruster] = before._acquittals[number]
 
     def _explain(self, alive: np.ndarray) -> int:
         """Returns the one thruster that explains the change, or -1."""
