@@ -38,10 +38,10 @@ COMMANDED_N = 0.3
 LEFT_OUT = re.compile(r"thruster (\d+) .*: left out")
 
 
-def flown(scenario: Scenario, seed: int, parameters: Parameters | None = None) -> Flight:
+def flown(scenario: Scenario, seed: int, parameters: Parameters | None = None, rate_hz: int = 100) -> Flight:
     """Flies a scenario and returns the flight; its logs are discarded."""
     with tempfile.TemporaryDirectory() as folder:
-        fly_scenario(scenario, seed, parameters or Parameters(), Path(folder), f"virtual:{Path(folder).name}")
+        fly_scenario(scenario, seed, parameters or Parameters(), Path(folder), f"virtual:{Path(folder).name}", rate_hz)
         return read_flight(Path(folder))
 
 
@@ -133,14 +133,14 @@ ICM_20602 = Imu(math.radians(0.004) * math.sqrt(50.0), 100e-6 * 9.81 * math.sqrt
 """IMU of many autopilots: 0.004 deg/s and 100 ug per root of Hz (TDK InvenSense DS-000176), over the 50 Hz of 100 samples a second."""
 
 
-def hover_blind(seed: int, imu: Imu | None = None) -> BlindFlight:
+def hover_blind(seed: int, imu: Imu | None = None, rate_hz: int = 100) -> BlindFlight:
     """Flies a hover that loses the tags for a while. With another IMU the filter's noise parameters keep their ratio to the sensor's."""
     scenario, parameters = load_scenario("hover-blind"), Parameters()
     for name, sigma in imu._asdict().items() if imu is not None else ():
         told = getattr(parameters.estimation, name) / getattr(scenario.sensors, name)
         parameters = parameters.replace(f"estimation.{name}", told * sigma)
         scenario = dataclasses.replace(scenario, sensors=dataclasses.replace(scenario.sensors, **{name: sigma}))
-    flight, wanted = in_task(scenario, flown(scenario, seed, parameters))
+    flight, wanted = in_task(scenario, flown(scenario, seed, parameters, rate_hz))
     off = np.linalg.norm((flight.p_wb - wanted.p_wb)[:, :2], axis=1)
     wrong = (flight.firmware["p_wb"] - flight.p_wb)[-1, :2] / flight.firmware["sigma_p"][-1, :2]
     return BlindFlight(float(off.max()), rms(off), (float(wrong[0]), float(wrong[1])))

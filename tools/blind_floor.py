@@ -55,11 +55,14 @@ class Model(NamedTuple):
     """(11,) process noise variances per tick: the diagonal of Q."""
     inertial: tuple[tuple[np.ndarray, float], tuple[np.ndarray, float]]
     """For accelerometer and gyro: (11,) row of the measurement matrix, and the variance of the measurement noise."""
+    period_s: float
     start: np.ndarray
     """(11,) initial variances."""
 
 
-def model(world: WorldSpec, sensors: SensorSpec, vehicle: Vehicle, unforeseen_n_m: float = UNFORESEEN_N_M) -> Model:
+def model(
+    world: WorldSpec, sensors: SensorSpec, vehicle: Vehicle, unforeseen_n_m: float = UNFORESEEN_N_M, period_s: float = PERIOD_S
+) -> Model:
     """Model of a robot at rest over ground in the world's mean current; accelerating water carries it along (Froude-Krylov and added mass).
 
     Args:
@@ -83,9 +86,9 @@ def model(world: WorldSpec, sensors: SensorSpec, vehicle: Vehicle, unforeseen_n_
     rates[RATE] += rates[RATE, TILT] / world.gravity * rates[WATER]
     rates[MOMENT, MOMENT] = -1.0 / MOMENT_S
     noise = np.zeros(STATES)
-    noise[GUST_TARGET] = tends**2 * (1.0 - math.exp(-2.0 * PERIOD_S / t1))
-    noise[MOMENT] = unforeseen_n_m**2 * (1.0 - math.exp(-2.0 * PERIOD_S / MOMENT_S))
-    noise[GYRO_BIAS], noise[ACCEL_BIAS] = sensors.gyro_walk**2 * PERIOD_S, sensors.accel_walk**2 * PERIOD_S
+    noise[GUST_TARGET] = tends**2 * (1.0 - math.exp(-2.0 * period_s / t1))
+    noise[MOMENT] = unforeseen_n_m**2 * (1.0 - math.exp(-2.0 * period_s / MOMENT_S))
+    noise[GYRO_BIAS], noise[ACCEL_BIAS] = sensors.gyro_walk**2 * period_s, sensors.accel_walk**2 * period_s
     felt, turning = rates[SPEED].copy(), np.zeros(STATES)
     felt[TILT], felt[ACCEL_BIAS] = world.gravity, 1.0
     turning[RATE] = turning[GYRO_BIAS] = 1.0
@@ -94,7 +97,8 @@ def model(world: WorldSpec, sensors: SensorSpec, vehicle: Vehicle, unforeseen_n_
         INITIAL_PLACE_SIGMA, *water, INITIAL_TILT_SIGMA, INITIAL_RATE_SIGMA, unforeseen_n_m, INITIAL_MOMENT_SIGMA, *biases,
         INITIAL_PUSH_SIGMA,
     ]) ** 2  # fmt: skip
-    return Model(expm(PERIOD_S * rates), noise, ((felt, sensors.accel_sigma**2), (turning, sensors.gyro_sigma**2)), start)
+    inertial = ((felt, sensors.accel_sigma**2), (turning, sensors.gyro_sigma**2))
+    return Model(expm(period_s * rates), noise, inertial, period_s, start)
 
 
 def gain(covariance: np.ndarray, row: np.ndarray, variance: float) -> tuple[np.ndarray, np.ndarray]:
@@ -109,11 +113,11 @@ def with_tags(axis: Model, sensors: SensorSpec, seconds: float) -> np.ndarray:
     covariance = np.diag(axis.start)
     tags = [(PLACE, sensors.tag_sigma_m**2), (TILT, math.radians(sensors.tag_sigma_deg) ** 2)]
     pictures = 0
-    for tick in range(round(seconds / PERIOD_S)):
+    for tick in range(round(seconds / axis.period_s)):
         covariance = axis.step @ covariance @ axis.step.T + np.diag(axis.noise)
         for row, variance in axis.inertial:
             covariance = gain(covariance, row, variance)[1]
-        if tick * PERIOD_S * sensors.tag_rate_hz >= pictures:
+        if tick * axis.period_s * sensors.tag_rate_hz >= pictures:
             pictures += 1
             for state, variance in tags:
                 covariance = gain(covariance, np.eye(STATES)[state], variance)[1]
@@ -123,7 +127,7 @@ def with_tags(axis: Model, sensors: SensorSpec, seconds: float) -> np.ndarray:
 def without_tags(axis: Model, covariance: np.ndarray, seconds: float) -> tuple[list[list[np.ndarray]], np.ndarray]:
     """Kalman gains, (11,) each, of accelerometer and gyro in every tick, and the covariance (11, 11) after `seconds` with these alone."""
     gains: list[list[np.ndarray]] = []
-    for _ in range(round(seconds / PERIOD_S)):
+    for _ in range(round(seconds / axis.period_s)):
         covariance = axis.step @ covariance @ axis.step.T + np.diag(axis.noise)
         gains.append([])
         for row, variance in axis.inertial:
@@ -150,11 +154,11 @@ def largest_errors(axis: Model, covariance: np.ndarray, seconds: float) -> np.nd
     return largest
 
 
-def floor(imu: Imu | None = None, unforeseen_n_m: float = UNFORESEEN_N_M) -> tuple[float, float]:
+def floor(imu: Imu | None = None, unforeseen_n_m: float = UNFORESEEN_N_M, rate_hz: int = 100) -> tuple[float, float]:
     """Median and 95 % quantile of the largest horizontal error in the blind part of the scenario `hover-blind`, m; with `imu` if given."""
     scenario = load_scenario("hover-blind")
     sensors = scenario.sensors if imu is None else SensorSpec(**imu._asdict())
-    axis = model(scenario.world, sensors, load_vehicle(scenario.module[0].vehicle), unforeseen_n_m)
+    axis = model(scenario.world, sensors, load_vehicle(scenario.module[0].vehicle), unforeseen_n_m, 1.0 / rate_hz)
     errors = largest_errors(axis, with_tags(axis, sensors, scenario.task.settle_s), scenario.task.duration_s)
     return float(np.median(errors)), float(np.quantile(errors, 0.95))
 
@@ -162,9 +166,10 @@ def floor(imu: Imu | None = None, unforeseen_n_m: float = UNFORESEEN_N_M) -> tup
 def main() -> None:
     """Prints the floors; takes no arguments."""
     Parser(description=__doc__).parse_args()
-    for name, imu in (("the simulated IMU", None), ("an ICM-20602", ICM_20602)):
+    simulated, other = "the simulated IMU", "an ICM-20602"
+    for name, imu, rate_hz in ((simulated, None, 100), (f"{simulated} at 400 Hz", None, 400), (other, ICM_20602, 100)):
         for unforeseen_n_m in (UNFORESEEN_N_M, 1e-4, EXACT_N_M):
-            median, most = floor(imu, unforeseen_n_m)
+            median, most = floor(imu, unforeseen_n_m, rate_hz)
             told = f"{name}, moments known to {1e3 * unforeseen_n_m:g} mN m"
             print(f"{told}: no filter keeps better than {1e3 * median:.1f} mm (median) and {1e3 * most:.1f} mm (95 %)")
 
