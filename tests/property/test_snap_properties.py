@@ -19,6 +19,7 @@ def waypoints(count: int, seed: int) -> list[Waypoint]:
     return [Waypoint(p, q) for p, q in zip(rng.normal(size=(count, 3)), turns, strict=True)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("limits", "columns", "bound"),
     [(Limits(angular_rate=0.6), slice(10, 13), 0.6), (Limits(angular_acceleration=0.5), slice(16, 19), 0.5)],

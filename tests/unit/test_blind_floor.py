@@ -13,6 +13,8 @@ from hil.plant.bodies import weigh
 from hil.plant.spec import SensorSpec, WorldSpec
 from hil.safety import ICM_20602
 
+pytestmark = pytest.mark.slow
+
 BLIND_S = 5.0
 UNKNOWN_N_M = 0.1
 """Large enough that the moments are as good as unknown: only the gyro measures the rotation."""

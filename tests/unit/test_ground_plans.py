@@ -59,6 +59,7 @@ def test_plans_that_nobody_waits_for_any_more_are_not_made(monkeypatch: pytest.M
         assert side._plans == [] and planned == [(1, 0), (0, 99)]
 
 
+@pytest.mark.slow
 def test_planning_process_ends_a_plan_that_its_body_does_not_wait_for_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
     """The process then makes the next plan. Regression: that plan waited until the abandoned one was complete."""
     leg = Leg(0, np.ones(3), None, 0.0, 0.3)

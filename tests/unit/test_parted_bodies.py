@@ -69,6 +69,7 @@ def test_parted_modules_magnets_keep_their_accounts() -> None:
     assert min(before[0]) < 59.0 and min(after[0]) < min(before[0]) and min(after[1]) < min(before[1])
 
 
+@pytest.mark.slow
 def test_joint_that_holds_for_a_moment_and_is_lost_again_is_parted_by_another_plan() -> None:
     """The first plan arrives while no joint is open, and is dropped."""
     tank = FaultyTank(RING[:2], delay=60)

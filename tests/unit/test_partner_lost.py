@@ -13,6 +13,8 @@ from firmware_py.core.undocking import IN_PLACE
 from firmware_py.description.parameters import Parameters
 from tests.unit.tanks import LOST, RING, TAG_DELAY_TICKS, FaultyTank
 
+pytestmark = pytest.mark.slow
+
 
 def test_module_that_is_lost_is_parted_half_a_second_later_and_both_hold() -> None:
     tank = FaultyTank(RING[:2])

@@ -61,6 +61,7 @@ def energy_history(world: World) -> np.ndarray:
     return np.array(energy)
 
 
+@pytest.mark.slow
 def test_hulls_that_collide_at_any_tilt_gain_no_energy_and_keep_their_momentum() -> None:
     met = 0
     for seed in range(COLLISIONS):
@@ -73,6 +74,7 @@ def test_hulls_that_collide_at_any_tilt_gain_no_energy_and_keep_their_momentum()
     assert met > 0.8 * COLLISIONS, "they must meet, or the test proves nothing"
 
 
+@pytest.mark.slow
 def test_springs_of_hulls_give_back_what_they_took() -> None:
     """Without damping, and therefore without friction, energy is neither lost nor gained."""
     met = 0

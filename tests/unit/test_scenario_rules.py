@@ -351,6 +351,7 @@ def test_hull_that_touches_a_wall_or_floats_is_put_into_the_water(load: Load, pl
     make_world(load("hover", "[0.0, 0.0, 0.38]", place), 0, 10_000_000)
 
 
+@pytest.mark.slow
 def test_no_shape_that_a_seed_draws_starts_in_a_wall(load: Load) -> None:
     polycube = load_scenario("polycube")
     for seed in range(20):

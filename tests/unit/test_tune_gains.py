@@ -137,6 +137,7 @@ def test_search_that_was_killed_loses_no_trial_and_ends_in_the_same_bytes(tools:
     assert path.read_bytes() == (tmp_path / "whole" / "search.jsonl").read_bytes()
 
 
+@pytest.mark.slow
 def test_objective_that_reaches_zero_is_searched_on(tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fly(scenario: Scenario, parameters: Parameters, seed: int, bus: str, code: str) -> dict[str, Any]:
         return {"seed": seed, "metrics": {"position_rmse_m": 0.0, "thrust_rms_n": max(0.0, parameters.control.position_bandwidth - 2.0)}}
@@ -146,6 +147,7 @@ def test_objective_that_reaches_zero_is_searched_on(tools: tuple[Any, Any], tmp_
     assert study.best_value == 0.0 and len(study.trials) == 14
 
 
+@pytest.mark.slow
 def test_other_seed_searches_elsewhere(tools: tuple[Any, Any], tmp_path: Path) -> None:
     first, second = (search(tools, tmp_path / str(seed), 5, Inline(), seed) for seed in (0, 1))
     assert first.trials[0].params == second.trials[0].params and first.trials[1].params != second.trials[1].params
@@ -262,6 +264,7 @@ def drawn(tools: tuple[Any, Any], monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     return figures
 
 
+@pytest.mark.slow
 def test_legends_of_the_bode_plot_stand_where_no_line_runs(drawn: list[Any]) -> None:
     from loop_response import Response
     from tune_plots import draw_bode
@@ -296,6 +299,7 @@ def test_steps_fill_their_plot_and_each_is_seen_where_the_others_agree_with_it(d
     assert lines["shipped"].get_linewidth() > 2.0 * lines["tuned"].get_linewidth()
 
 
+@pytest.mark.slow
 def test_plots_of_a_search_are_of_the_vehicle_that_it_flies(
     drawn: list[Any], tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

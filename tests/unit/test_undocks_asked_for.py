@@ -14,6 +14,8 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.prepare.assembly import PITCH_M
 from tests.unit.tanks import RING, FaultyTank, world
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("stop", ["e-stop", "DISARM", "mode"])
 def test_undock_ends_with_its_mode_and_the_joint_holds(stop: str) -> None:

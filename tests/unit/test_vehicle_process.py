@@ -68,6 +68,7 @@ def test_robot_that_carries_no_tag_is_told_so_at_its_start(name: str, told: int,
     assert sum(line.startswith("warning: module 1 carries no [[tag]]: ") for line in said) == told
 
 
+@pytest.mark.slow
 def test_vehicle_says_that_a_bus_takes_no_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(link: VirtualLink, bus: Any, frame: Frame) -> None:
         raise OSError(errno.ENOBUFS, "No buffer space available")
