@@ -132,22 +132,34 @@ def sift(requests: Sequence[Request], bodies: Mapping[int, Body]) -> tuple[list[
 
 
 def follow(requests: Sequence[Request], before: Sequence[Body], bodies: Mapping[int, Body]) -> list[Request]:
-    """Readdresses the requests of a tick in which bodies may have joined or parted: DISARM goes to every body that has a module of the
-    body it named.
+    """Readdresses requests whose body has joined or parted, in this tick or earlier: those that stop a body reach the modules it had.
+
+    DISARM goes to every body that has a module of the body it named. A request that merely ends what a body does goes to the body that
+    holds the module of that number if no body has the number any more.
 
     Args:
         before: the bodies at the beginning of the tick. bodies: the present ones, by number.
     """
     found: list[Request] = []
     for request in requests:
-        meant = _holders(request.body, before, bodies) if request.action == Action.DISARM else []
+        is_meant = request.action == Action.DISARM or (request.body not in bodies and _ends_a_task(request))
+        meant = _holders(request.body, before, bodies) if is_meant else []
         found += [request._replace(body=number) for number in meant] or [request]
     return found
 
 
+def _ends_a_task(request: Request) -> bool:
+    """Whether the request makes a body hold its place or surface, whatever it does: safe for the whole of which it is a part now."""
+    if request.action == Action.HOLD:
+        return request.argument is None
+    return request.action == Action.SET_MODE and request.argument in (Mode.POSHOLD, Mode.SURFACE)
+
+
 def _holders(named: int, before: Sequence[Body], bodies: Mapping[int, Body]) -> list[int]:
-    """Numbers of the bodies that include a module of a body that has the number `named`, or had it at the beginning of the tick."""
-    modules = {module for body in (*before, *bodies.values()) if body.index == named for module in body.modules}
+    """Numbers of the bodies that include a module of a body that has the number `named`, or had it at the beginning of the tick. A body
+    has the number of its first module: if none has it now, the one that includes that module counts.
+    """
+    modules = {named, *(module for body in (*before, *bodies.values()) if body.index == named for module in body.modules)}
     return [number for number, body in bodies.items() if not modules.isdisjoint(body.modules)]
 
 

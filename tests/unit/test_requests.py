@@ -74,8 +74,20 @@ SOUND_ONES: list[tuple[Action, Any]] = [
     (Action.SET_POINT, spoilt(q_wb=LEVEL * NAN, v_w=np.array([NAN, 0.0, 0.1]))), (Action.SET_PARAMETER, ("control.lead_s", 0.1)),
     (Action.MOTOR_TEST, (7, -0.1, 2)), (Action.HOLD, spoilt(q_wb=LEVEL * 1.0009)), (Action.HOLD, spoilt(p_wb=np.full(3, 1e6))),
 ]  # fmt: skip
+ENDS_A_TASK = [
+    Request(Action.DISARM, 1), Request(Action.DISARM, 1, True), Request(Action.HOLD, 1), Request(Action.SET_MODE, 1, Mode.POSHOLD),
+    Request(Action.SET_MODE, 1, Mode.SURFACE),
+]  # fmt: skip
+BEGINS_A_TASK = [
+    Request(Action.ARM, 1), Request(Action.HOLD, 1, HERE), Request(Action.SET_MODE, 1, Mode.AUTO), Request(Action.SET_POINT, 1, HERE),
+    Request(Action.MOTOR_TEST, 1, (1, 0.3, 2.0)), Request(Action.DOCK, 1, DOCK), Request(Action.STICKS, 1, STICKS),
+]  # fmt: skip
 PAIR = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2, [0, 1])
 APART = {0: single(0), 1: single(1)}
+
+
+def action_of(request: Request) -> str:
+    return f"{request.action.name} {getattr(request.argument, 'name', '')}".strip()
 
 
 def name(value: Any) -> str:
@@ -145,7 +157,44 @@ def test_disarm_reaches_every_body_that_has_a_module_of_the_one_that_it_names() 
     assert follow([Request(Action.DISARM, 7)], apart, {0: PAIR, 2: other}) == [Request(Action.DISARM, 7)], "which nobody is"
 
 
+@pytest.mark.parametrize("request_", ENDS_A_TASK, ids=action_of)
+def test_stop_for_a_number_that_leads_no_body_any_more_reaches_the_body_that_holds_its_module(request_: Request) -> None:
+    """A person still sees two robots in the ticks after a join, and whoever sends 'disarm' must be obeyed."""
+    joined = [PAIR, single(2)]
+    assert follow([request_], joined, {body.index: body for body in joined}) == [request_._replace(body=0)]
+    assert follow([request_], [*APART.values()], APART) == [request_], "there is such a body: it alone is meant"
+
+
+@pytest.mark.parametrize("request_", BEGINS_A_TASK, ids=action_of)
+def test_task_for_a_number_that_leads_no_body_any_more_is_given_to_nobody(request_: Request) -> None:
+    """It was meant for one module alone, at its own place."""
+    assert follow([request_], [PAIR], {0: PAIR}) == [request_]
+
+
 # ---------------------------------------------------------------- in flight
+
+
+def pair_in_flight() -> Tank:
+    tank = Tank([PAIR])
+    tank.run(0.5)
+    tank.run(0.5, Request(Action.ARM))
+    assert tank.outputs[-1].records[0].state == State.ARMED
+    return tank
+
+
+def test_docked_robot_is_disarmed_by_the_number_of_either_module() -> None:
+    outputs = pair_in_flight().run(DT, Request(Action.DISARM, 1))
+    assert outputs.records[0].state == State.DISARMED
+    assert not any(command.armed or command.thrusters.any() for command in outputs.modules)
+    assert not any("refused" in event.text for event in outputs.events)
+
+
+@pytest.mark.parametrize("mode", [Mode.POSHOLD, Mode.SURFACE])
+def test_docked_robot_holds_its_place_or_surfaces_by_the_number_of_either_module(mode: Mode) -> None:
+    tank = pair_in_flight()
+    tank.run(DT, Request(Action.SET_MODE, 0, Mode.MANUAL))
+    assert tank.run(DT, Request(Action.SET_MODE, 1, mode)).records[0].mode == mode
+    assert "there is no body 1" in tank.run(DT, Request(Action.SET_MODE, 1, Mode.MANUAL)).events[0].text
 
 
 def test_robot_flies_on_through_every_request_without_sense() -> None:
