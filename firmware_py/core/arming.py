@@ -11,7 +11,7 @@ from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.transitions import MODES, Need
 from firmware_py.core.types import Mode
-from firmware_py.description.parameters import Parameters, invalid
+from firmware_py.description.parameters import Parameters, contradictions, invalid
 
 
 class Question(NamedTuple):
@@ -110,10 +110,7 @@ def _frames(q: Question) -> str:
 
 
 def _parameters(q: Question) -> list[str]:
-    fence, wrong = q.parameters.fence, invalid(q.parameters)
-    if fence.top_m >= fence.bottom_m:
-        wrong.append(f"fence.top_m is {fence.top_m:g}, fence.bottom_m {fence.bottom_m:g}: the top must be at less depth")
-    return wrong
+    return invalid(q.parameters) + contradictions(q.parameters)
 
 
 def _warm(q: Question) -> str:

@@ -46,7 +46,7 @@ from firmware_py.core.types import (
     Request,
     Thrust,
 )  # fmt: skip
-from firmware_py.description.parameters import Parameters
+from firmware_py.description.parameters import Parameters, changed
 from firmware_py.description.schema import DescriptionError
 
 ESTIMATORS: dict[str, type[Estimator] | type[TagOnlyEstimator]] = {"full": Estimator, "paper": TagOnlyEstimator}
@@ -246,14 +246,19 @@ class Pipeline:
         return outputs
 
     def _retune(self, requests: Sequence[Request], outputs: Outputs) -> None:
-        """Applies parameters set since the last tick. A value that passed a ground station's registry may still be refused here."""
+        """Applies parameters set since the last tick, one after the other. A value that passed a ground station's registry may still be
+        refused here.
+
+        While any body is armed, a value is refused after which the arming checks would refuse the parameters. While all are disarmed
+        it is taken, because a ground station loads a file one parameter at a time, in an order of its own.
+        """
         wanted = dict(r.argument for r in requests if r.action == Action.SET_PARAMETER)
         if not wanted:
             return
-        parameters = self.parameters
+        parameters, is_armed = self.parameters, any(pipeline.supervisor.armed for pipeline in self.formation.pipelines)
         for name, value in wanted.items():
             try:
-                parameters = parameters.replace(name, value)
+                parameters = changed(parameters, name, value, is_armed)
             except DescriptionError as error:
                 outputs.events.append(Event(WARNING, str(error)))
         self.formation.retune(parameters)

@@ -389,6 +389,24 @@ def invalid(parameters: Parameters) -> list[str]:
     return reasons
 
 
+def contradictions(parameters: Parameters) -> list[str]:
+    """Reports, in words, parameters that are in range one by one but not together; empty if there are none."""
+    fence = parameters.fence
+    if fence.top_m < fence.bottom_m:
+        return []
+    return [f"fence.top_m is {fence.top_m:g}, fence.bottom_m {fence.bottom_m:g}: the top must be at less depth"]
+
+
+def changed(parameters: Parameters, dotted: str, value: float | str, is_armed: bool) -> Parameters:
+    """Returns a copy with `group.field` set. Raises DescriptionError as `Parameters.replace` does, and in flight (`is_armed`) if the copy
+    would contradict itself.
+    """
+    after = parameters.replace(dotted, value)
+    if is_armed and (reasons := contradictions(after)):
+        raise DescriptionError(f"parameter {dotted} stays while a vehicle is armed: {'; '.join(reasons)}")
+    return after
+
+
 def load_parameters(path: Path) -> Parameters:
     """Loads the parameters in `path`; missing ones keep their defaults. Raises DescriptionError, one line."""
     table, source = read_toml(path)

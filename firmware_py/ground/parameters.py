@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.core.types import WARNING, Action
-from firmware_py.description.parameters import Parameters, registry
+from firmware_py.description.parameters import Parameters, changed, registry
 from firmware_py.description.schema import DescriptionError, Limits
 from firmware_py.ground.files import write_atomically
 from firmware_py.ground.stored_parameters import differences_toml, with_stored_values
@@ -45,22 +45,22 @@ class ParameterStore:
         """Returns the value of the parameter with this MAVLink name. Raises KeyError."""
         return float(attrgetter(self.names[name][0])(self.values))
 
-    def set(self, name: str, value: float) -> tuple[str, float]:
+    def set(self, name: str, value: float, is_armed: bool = False) -> tuple[str, float]:
         """Changes one parameter; if its value is new, stores all parameters that differ from those at start. Returns the name in the
         registry and the value as kept.
 
         Raises:
-            DescriptionError: out of range.
+            DescriptionError: out of range, or in flight (`is_armed`) in contradiction with another parameter.
             OSError: it cannot be stored; the old value stays.
         """
         dotted, _ = self.names[name]
         before = attrgetter(dotted)(self.values)
         kind = type(before)
         kept = kind(value) if kind is not int else round(value)
-        changed = self.values.replace(dotted, kept)
+        after = changed(self.values, dotted, kept, is_armed)
         if self._path is not None and kept != before:
-            write_atomically(self._path, differences_toml(changed, self._started).encode())
-        self.values = changed
+            write_atomically(self._path, differences_toml(after, self._started).encode())
+        self.values = after
         return dotted, kept
 
 
@@ -106,16 +106,22 @@ class ParameterService:
         try:
             if not math.isfinite(value):
                 raise DescriptionError(f"parameter {name}: {value} is no number")
-            dotted, kept = self._store.set(name, value)
+            dotted, kept = self._store.set(name, value, self._system.subject.picture.any_armed)
         except (DescriptionError, OSError) as error:
             stays = f"parameter {name} stays, it cannot be stored"
-            wrong = str(error).replace(self._store.names[name][0], name)  # clients know only the MAVLink name
+            wrong = self._in_words_of_clients(str(error))
             self._system.say(WARNING, f"{stays}: {error.filename}: {error.strerror}" if isinstance(error, OSError) else wrong)
             self._system.send(arrival.channel, "PARAM_VALUE", self._value(name))
             return
         self._system.ask(Action.SET_PARAMETER, (dotted, kept))  # applies to every body
         for system in self._everybody():
             system.broadcast("PARAM_VALUE", self._value(name))
+
+    def _in_words_of_clients(self, text: str) -> str:
+        """Returns a text with the MAVLink names of the parameters, which are all that clients know."""
+        for name, (dotted, _) in sorted(self._store.names.items(), key=lambda each: len(each[1][0]), reverse=True):
+            text = text.replace(dotted, name)
+        return text
 
     def _value(self, name: str) -> dict[str, float | str]:
         return {

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Action
 from firmware_py.description.parameters import Parameters, load_parameters, registry
 from firmware_py.ground.config import GroundConfig
@@ -78,6 +79,22 @@ def test_out_of_range_is_refused_in_words_and_the_old_value_echoed(world: World,
     for nonsense in (math.nan, math.inf, -math.inf):
         assert put(world, client, "POS_BW", nonsense) == SHIPPED
     assert not world.robot.asked
+
+
+def test_parameter_that_would_contradict_another_in_flight_is_refused_and_not_stored(world: World, client: Client, tmp_path: Path) -> None:
+    world.robot.state[0] = State.ARMED
+    world.run(1)
+    assert put(world, client, "FENCE_TOP", 60.0) == -1.0
+    words = "FENCE_TOP is 60, FENCE_BOTTOM 50: the top must be at less depth"
+    assert f"parameter FENCE_TOP stays while a vehicle is armed: {words}" in client.texts
+    assert not world.robot.asked and not list(tmp_path.iterdir())
+    assert put(world, client, "FENCE_BOTTOM", 100.0) == 100.0
+    assert put(world, client, "FENCE_TOP", 60.0) == 60.0
+
+
+def test_file_of_parameters_is_loaded_one_by_one_while_disarmed(world: World, client: Client) -> None:
+    assert put(world, client, "FENCE_TOP", 60.0) == 60.0
+    assert put(world, client, "FENCE_BOTTOM", 100.0) == 100.0
 
 
 def test_store_that_is_gone_is_named_with_what_is_wrong(world: World, client: Client, tmp_path: Path) -> None:

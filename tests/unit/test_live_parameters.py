@@ -10,7 +10,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.module_at_rest import PERIOD_NS, resting
-from tests.unit.tanks import RING, FaultyTank
+from tests.unit.tanks import RING, FaultyTank, Tank, single
 
 
 @pytest.fixture
@@ -36,6 +36,47 @@ def test_value_out_of_range_is_refused_in_words_and_changes_nothing(flying: Pipe
     outputs = step(flying, 120, [Request(Action.SET_PARAMETER, 0, ("control.position_bandwidth", 99.0))])
     assert flying.parameters.control.position_bandwidth == Parameters().control.position_bandwidth
     assert any("out of range" in event.text for event in outputs.events)
+
+
+def fence_after(pipeline: Pipeline, tick: int, *wanted: tuple[str, float]) -> tuple[float, float, list[str]]:
+    """Top and bottom of the fence after a tick with these requests, and what was said."""
+    outputs = step(pipeline, tick, [Request(Action.SET_PARAMETER, 0, (f"fence.{side}_m", value)) for side, value in wanted])
+    fence = pipeline.parameters.fence
+    return fence.top_m, fence.bottom_m, [event.text for event in outputs.events]
+
+
+def test_fence_that_arming_would_refuse_is_refused_in_flight(flying: Pipeline) -> None:
+    """A robot told to hold its place went 4 m down instead, to the bottom of a fence whose top was below it."""
+    words = "fence.top_m is 60, fence.bottom_m 50: the top must be at less depth"
+    assert fence_after(flying, 120, ("top", 60.0)) == (-1.0, 50.0, [f"parameter fence.top_m stays while a vehicle is armed: {words}"])
+    assert fence_after(flying, 121, ("top", 49.9)) == (49.9, 50.0, [])
+
+
+def test_fence_is_moved_in_flight_by_way_of_one_that_is_valid(flying: Pipeline) -> None:
+    assert fence_after(flying, 120, ("bottom", 100.0), ("top", 60.0)) == (60.0, 100.0, [])
+    *fence, said = fence_after(flying, 121, ("bottom", 3.0), ("top", 0.0))
+    assert fence == [0.0, 100.0] and len(said) == 1, "the bottom would have been above the top"
+    assert fence_after(flying, 122, ("bottom", 3.0)) == (0.0, 3.0, [])
+
+
+def test_disarmed_robot_takes_a_file_of_parameters_in_any_order_and_is_not_armed_before_its_end() -> None:
+    pipeline = Pipeline([assemble_vehicle(load_vehicle("modcube"))], Parameters(), PERIOD_NS)
+    for tick in range(1, 60):
+        step(pipeline, tick, [])
+    assert fence_after(pipeline, 60, ("top", 60.0)) == (60.0, 50.0, [])
+    outputs = step(pipeline, 61, [Request(Action.ARM, 0, True)])
+    assert "the top must be at less depth" in outputs.events[0].text and outputs.records[0].state == State.DISARMED
+    assert fence_after(pipeline, 62, ("bottom", 100.0)) == (60.0, 100.0, [])
+    assert step(pipeline, 63, [Request(Action.ARM, 0, True)]).records[0].state == State.ARMED
+
+
+def test_fence_stays_while_any_robot_of_the_fleet_is_armed() -> None:
+    tank = Tank([single(0), single(1)])
+    tank.run(0.5)
+    tank.run(0.1, Request(Action.ARM, 1))
+    assert [record.state for record in tank.outputs[-1].records] == [State.DISARMED, State.ARMED]
+    outputs = tank.run(0.01, Request(Action.SET_PARAMETER, 0, ("fence.top_m", 60.0)))
+    assert tank.pipeline.parameters.fence.top_m == -1.0 and len(outputs.events) == 1
 
 
 def test_limits_set_in_flight_are_those_of_every_stage_from_that_tick_on(flying: Pipeline) -> None:
