@@ -28,6 +28,12 @@ the body."""
 NEAR_M, NEAR_RAD = 0.2, 0.35
 """Largest distance, in m and rad, between set-point and body at which the set-point continues from where it is; otherwise it restarts from
 the body."""
+LEAST_LIFT = 0.5
+"""Share of `surface_force_n` with which SURFACE lifts a body that believes to be at the surface: a depth sensor that reads too shallow
+must not keep a robot down. 1.5 N is three times the buoyancy that a module may lack on the bench, and lifts the hull 3 mm farther out of
+the water."""
+SURFACE_MARGIN_M = 0.02
+"""Depth below that of the surface at which the body counts as there."""
 COME_M = 0.005
 """Distance from the meeting point within which the set-point of a body that moves to meet another counts as arrived."""
 
@@ -91,6 +97,8 @@ class Guidance:
         self._no_place_s, self._no_depth_s = parameters.failsafes.tag_lost_limit, parameters.failsafes.depth_unknown_limit
         self._full_stick = p.stick_share * (0.5 * np.abs(t.matrix) @ (t.f_max - t.f_min))
         self._lift_n = p.surface_force_n * len(self._body.modules)
+        depth_m = self._body.r_bm[:, 2]
+        self._surface_m = p.surface_depth_m + float(depth_m.mean() - depth_m.min())  # the highest module is to be at the surface
         self._glider.retune(p.bandwidth, p.speed_m_s, p.rate_rad_s)
 
     def drop_stale_goals(self, estimate: Estimate, health: Health) -> None:
@@ -253,8 +261,9 @@ class Guidance:
         if self.mode == Mode.GUIDED:
             return self._guided(time_ns)
         if self.mode == Mode.SURFACE:
-            up = -p.surface_speed_m_s if at.p_wb[2] > p.surface_depth_m else 0.0
-            return Wish(np.array([0.0, 0.0, up]), ZERO, None, heading(at.q_wb))
+            if at.p_wb[2] > self._surface_m:
+                return Wish(np.array([0.0, 0.0, -p.surface_speed_m_s]), ZERO, None, heading(at.q_wb))
+            return Wish(ZERO, ZERO, np.array([math.nan, math.nan, self._surface_m]), heading(at.q_wb))
         if self.mode in (Mode.AUTO, Mode.DOCK):
             return self._docking if isinstance(self._docking, Wish) else REST
         sticks = self._read_sticks(time_ns)
@@ -345,14 +354,20 @@ class Guidance:
         return np.asarray(out)
 
     def _surfacing(self, wrench: np.ndarray, estimate: Estimate, health: Health) -> np.ndarray:
-        """Wrench of SURFACE: upward by the controller, or by a constant force if depth is unknown; horizontal only if position is known."""
+        """Wrench of SURFACE: upward by the controller, or by a constant force if depth is unknown; horizontal only if position is known.
+
+        At the surface it lifts with at least LEAST_LIFT, and below it pushes down with no more: the believed depth may be wrong.
+        """
         if not health.ready:
             return np.asarray(np.r_[0.0, 0.0, -self._lift_n, 0.0, 0.0, 0.0])
         out = wrench.copy()
         force_w = np.asarray(rotate(estimate.q_wb, wrench[:3].copy()))
         if not self._placed(health):
             force_w[:2] = 0.0
+        is_up = estimate.p_wb[2] <= self._surface_m + SURFACE_MARGIN_M
         if health.depth_unknown_s > self._no_depth_s:
             force_w[2] = -self._lift_n
+        else:
+            force_w[2] = min(force_w[2], (-LEAST_LIFT if is_up else LEAST_LIFT) * self._lift_n)
         out[:3] = rotate_back(estimate.q_wb, force_w)
         return np.asarray(out)

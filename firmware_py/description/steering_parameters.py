@@ -57,10 +57,11 @@ class Steering:
     )
     surface_speed_m_s: float = quantity(0.10, unit="m/s", low=0.01, high=2, help="ascent speed in SURFACE", mavlink="SURF_SPEED")
     surface_depth_m: float = quantity(
-        0.12, unit="m", low=0, high=10, help="depth of the centre of mass at the surface", mavlink="SURF_DEPTH"
+        0.12, unit="m", low=0, high=10, help="depth of the (highest docked) module's centre of mass at the surface", mavlink="SURF_DEPTH"
     )
     surface_force_n: float = quantity(
-        3.0, unit="N", low=0, high=1000, help="upward force per module in SURFACE while depth is unknown", mavlink="SURF_FORCE"
+        3.0, unit="N", low=0, high=1000,
+        help="upward force per module in SURFACE while depth is unknown; at the surface at least half of it", mavlink="SURF_FORCE"
     )
     blend_s: float = quantity(
         0.3, unit="s", low=0, high=5, help="time over which the wrench is blended into that of a new mode", mavlink="MODE_BLEND"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, Mode, Outputs, Request
+from firmware_py.core.types import Action, Inputs, Mode, Outputs, Request
 from firmware_py.description.parameters import Parameters
 from hil.bench import Bench, open_bench
 from hil.fuzz import fuzz_flight
@@ -120,6 +120,36 @@ def test_docked_module_that_falls_silent_is_carried_in_place_by_the_other(direct
     fly("mobius-2", 18.0, silence, lambda bench: None, watch)
     assert 0.001 < np.sqrt(np.mean(np.square(off_m))) < 0.005
     assert max(off_m) < 0.010
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("scenario", "offset_pa"), [("faults", -30_000.0), ("faults", 0.0), ("mobius-2", -10_000.0), ("mobius-2", 0.0)])
+def test_robot_without_tags_surfaces_though_it_believes_to_be_there_and_rests_there(scenario: str, offset_pa: float) -> None:
+    """A pressure sensor that reads too shallow kept it down. Up there, a healthy robot used to lift itself half out of the water."""
+    depth_m: list[float] = []
+    current_a: list[float] = []
+
+    def lie(bench: Bench) -> None:
+        step, asked = bench.firmware.pipeline.step, {250: Mode.ALT_HOLD, 600: Mode.SURFACE}
+
+        def told(inputs: Inputs) -> Outputs:
+            for module in inputs.modules:
+                module.pressure_pa = None if module.pressure_pa is None else module.pressure_pa + offset_pa
+            if inputs.tick in asked:
+                inputs.requests = [Request(Action.SET_MODE, 0, asked[inputs.tick])]
+            return step(inputs)
+
+        bench.firmware.pipeline.step = told  # type: ignore[method-assign]
+
+    def watch(bench: Bench, outputs: Outputs) -> None:
+        truth = bench.nodes.world.truth(0)
+        depth_m.append(float(truth.p_wm[2]))
+        current_a.append(truth.current_a)
+
+    fly(scenario, 45.0, Fault(kind="tag_absent", at_s=0.0), lie, watch)
+    assert depth_m[600] > 0.8
+    assert max(depth_m[-300:]) < 0.2 and np.ptp(depth_m[-300:]) < 0.02
+    assert 0.5 < np.mean(current_a[-300:]) < 3.5
 
 
 def fly(scenario: str, seconds: float, fault: Fault, prepare: Callable[[Bench], None], watch: Callable[[Bench, Outputs], None]) -> None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from firmware_py.core.body import Body
 from firmware_py.core.guidance_modes import Guidance
 from firmware_py.core.health import Health
 from firmware_py.core.supervisor import Decision
@@ -28,8 +29,8 @@ def estimate(p: tuple[float, ...] = (0.0, 0.0, 1.0), q: np.ndarray | None = None
 class Flight:
     """Guidance over ticks, with a body that follows its set-points exactly."""
 
-    def __init__(self, parameters: Parameters | None = None) -> None:
-        self.guidance = Guidance(BODY, parameters or Parameters())
+    def __init__(self, parameters: Parameters | None = None, body: Body = BODY) -> None:
+        self.guidance = Guidance(body, parameters or Parameters())
         self.time_ns = 0
         self.estimate = estimate()
         self.guidance.rest(self.estimate)

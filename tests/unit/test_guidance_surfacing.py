@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-from firmware_py.core.rotations import difference, from_euler, heading
+from firmware_py.core.rotations import difference, from_euler, heading, rotate
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import Effect
 from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
 from tests.unit.guidance_flight import LEVEL, WRENCH, ZERO, Flight, estimate
 from tests.unit.healths import BLIND, GOOD, UPRIGHT
 
@@ -17,8 +19,8 @@ def test_surfacing_robot_rises_levels_and_stays_up() -> None:
     flight.estimate = estimate(q=from_euler(0.4, -0.6, 1.0))
     flight.guidance.rest(flight.estimate)
     flight.do(Effect.ENTER_MODE, Mode.SURFACE)
-    now = flight.run(15.0)
-    assert 0.05 < now.p_wb[2] < 0.13 and np.abs(now.v_w).max() < 1e-3
+    now = flight.run(40.0)
+    assert now.p_wb[2] == pytest.approx(Parameters().steering.surface_depth_m, abs=1e-3) and np.abs(now.v_w).max() < 1e-3
     np.testing.assert_allclose(now.p_wb[:2], 0.0, atol=1e-9)
     assert np.linalg.norm(difference(now.q_wb, heading(now.q_wb))) < 1e-3
 
@@ -28,13 +30,33 @@ def test_surfacing_robot_lifts_blindly_when_it_must() -> None:
     for health, expected in (
         (BLIND, [0.0, 0.0, lift, 0.0, 0.0, 0.0]),
         (GOOD._replace(tag_age_s=9.0, depth_age_s=9.0), [0.0, 0.0, lift, *WRENCH[3:]]),
-        (GOOD._replace(tag_age_s=9.0), [0.0, 0.0, *WRENCH[2:]]),
-        (GOOD, WRENCH),
+        (GOOD._replace(tag_age_s=9.0), [0.0, 0.0, -0.5 * lift, *WRENCH[3:]]),
+        (GOOD, [*WRENCH[:2], -0.5 * lift, *WRENCH[3:]]),
     ):
         flight = Flight()
         flight.do(Effect.ENTER_MODE, Mode.SURFACE)
         flight.run(0.5, health=health)
         np.testing.assert_allclose(flight.wrenches[-1], expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("depth_m", [0.13, 0.0, -10.0])
+def test_robot_that_believes_to_be_at_the_surface_is_lifted_all_the_same(depth_m: float) -> None:
+    """A pressure sensor that read too shallow kept a robot with a leak under water. The controller would push down with 3 N here."""
+    flight = Flight()
+    flight.estimate = estimate((0.0, 0.0, depth_m), from_euler(0.5, -0.3, 2.0))
+    flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+    flight.run(5.0, health=GOOD._replace(tag_age_s=9.0), follows=False)
+    lift_w = rotate(flight.estimate.q_wb, flight.wrenches[-1][:3].copy())
+    np.testing.assert_allclose(lift_w, [0.0, 0.0, -0.5 * Parameters().steering.surface_force_n], atol=1e-12)
+
+
+def test_stacked_robot_stays_with_its_highest_module_at_the_surface() -> None:
+    """With its centre of mass there it lifted half a module out of the water, with all the power that its supply had."""
+    stack = assemble([(0, 0, 0), (0, 0, -1), (0, 0, 1)], [0] * 3, [load_vehicle("modcube")] * 3, [0, 1, 2])
+    flight = Flight(body=stack)
+    flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+    assert flight.run(40.0).p_wb[2] == pytest.approx(Parameters().steering.surface_depth_m + 0.21, abs=1e-3)
+    assert rotate(flight.estimate.q_wb, flight.wrenches[-1][:3].copy())[2] == pytest.approx(-4.5), "1.5 N for each module"
 
 
 @pytest.mark.parametrize("mode", [Mode.STABILIZE, Mode.ALT_HOLD, Mode.SURFACE])
