@@ -69,7 +69,8 @@ class Health(NamedTuple):
     silent_s: float
     """Longest present silence of any module."""
     bus_silent_s: float
-    """Shortest present silence of any module."""
+    """Shortest present silence of any module, or the time without a tick before this one if that is longer: a process that was stopped has
+    heard nobody meanwhile, whatever it finds when it goes on."""
     esc_missing: tuple[int, ...]
     """Indices of thrusters whose ESC does not answer, or reports a fault."""
     frame_errors_per_s: float
@@ -226,12 +227,13 @@ class HealthMonitor:
         self._hear_operators(requests, now)
         self._rates(inputs, estimate, (now - latest.time_ns) * 1e-9)
         self._judge_tags(estimate, now)
+        stopped_ns = now - latest.time_ns - self._period_ns
         latest.time_ns = now
-        self.now = self._figures(estimate, faults)
+        self.now = self._figures(estimate, faults, stopped_ns)
         return self.now
 
-    def _figures(self, estimate: Estimate, faults: ThrusterFaults) -> Health:
-        """Returns all figures at the end of the tick."""
+    def _figures(self, estimate: Estimate, faults: ThrusterFaults, stopped_ns: int) -> Health:
+        """Returns all figures at the end of the tick. `stopped_ns`: by how much the tick began later than a period after the last one."""
         now, latest = self._latest.time_ns, self._latest
         return Health(
             time_ns=now,
@@ -250,7 +252,7 @@ class HealthMonitor:
             stopped=tuple([m for m, at in self._stopped_ns.items() if m in self._heard_ns or now - at <= self._answer_ns]),
             silent=tuple([m for m, at in self._answered_ns.items() if now - at > self._answer_ns]),
             silent_s=(now - min(self._heard_ns.values())) * 1e-9,
-            bus_silent_s=(now - max(self._heard_ns.values())) * 1e-9,
+            bus_silent_s=max(now - max(self._heard_ns.values()), stopped_ns) * 1e-9,
             esc_missing=_older(self._esc_ns, now - self._esc_fresh_ns),
             frame_errors_per_s=latest.error_rate,
             missed_ticks_per_s=latest.missed_rate,

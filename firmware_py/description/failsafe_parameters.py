@@ -37,9 +37,10 @@ class Failsafes:
     leak_delay_s: float = delay(0.5, "FS_LEAK_S")
     leak_action: int = action(4, "FS_LEAK_ACT")
     leak_latched: int = latched(1, "FS_LEAK_LAT")
-    # every module silent: the bus is off, and thrusters stop by themselves
+    # every module silent, or this process stopped for a while: the bus is off, and thrusters stop by themselves
     bus_silent_limit: float = quantity(
-        2.0, unit="s", low=0.1, high=60, help="longest permitted time without a frame from any module", mavlink="FS_BUS_LIM"
+        2.0, unit="s", low=0.1, high=60,
+        help="longest permitted time without a frame from any module, or without a tick", mavlink="FS_BUS_LIM"
     )
     bus_silent_delay_s: float = delay(0.0, "FS_BUS_S")
     bus_silent_action: int = action(5, "FS_BUS_ACT")

@@ -8,7 +8,8 @@ from typing import Protocol
 
 MACHINE_CLOCK = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 """A clock that keeps running during suspend, where the system has one: a ground computer whose lid was shut for an hour notices that it
-missed an hour, as after any stall, and disarms. With CLOCK_MONOTONIC it would continue with the commands that it held before."""
+missed an hour and disarms, as after any stall longer than `failsafes.bus_silent_limit`. With CLOCK_MONOTONIC it would continue with the
+commands that it held before."""
 _BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 
 

@@ -271,6 +271,19 @@ def test_bad_frames_and_missed_ticks_are_rates() -> None:
     assert health.missed_ticks_per_s == pytest.approx(50.0, rel=0.2)
 
 
+def test_time_without_a_tick_is_silence_of_the_bus_in_the_tick_after_it() -> None:
+    bench = MonitorBench()
+    assert bench.step(here(), here()).bus_silent_s == 0.0
+    assert bench.step(here(), here()).bus_silent_s == 0.0
+    bench.time_ns += 3_000_000_000
+    both = HealthMonitor(BODY, Parameters(), TICK_NS)
+    both.take_over([bench.monitor])
+    assert bench.step(here(), here()).bus_silent_s == 3.0
+    assert bench.step(here(), here()).bus_silent_s == 0.0
+    bench.monitor, bench.time_ns = both, bench.time_ns - 2 * TICK_NS
+    assert bench.step(here(), here()).bus_silent_s == 3.0, "nor does a body that joins in that tick lose it"
+
+
 def test_innovations_and_refusals_are_means_of_a_second() -> None:
     bench = MonitorBench()
     assert bench.step().nis_ratio == pytest.approx(1.0)

@@ -3,8 +3,13 @@
 import numpy as np
 import pytest
 
+from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode, ModuleInputs, Request
+from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+from tests.unit.module_at_rest import PERIOD_NS, resting
 from tests.unit.tanks import DT, Tank, has_power, single
 
 
@@ -107,6 +112,19 @@ def test_robot_that_lost_an_axis_trusts_its_thrusters_again_once_it_is_disarmed(
     tank.run(0.1, Request(Action.DISARM))
     assert pipeline.faults.now.dead == () and tank.run(3.0, Request(Action.ARM)).records[0].state == State.ARMED
     assert tank.outputs[-1].modules[0].thrusters.all(), "and they are used again"
+
+
+@pytest.mark.parametrize(("gap_s", "is_armed"), [(0.05, True), (0.5, True), (1.99, True), (2.02, False), (5.0, False), (86_400.0, False)])
+def test_robot_whose_process_was_stopped_comes_back_disarmed(gap_s: float, is_armed: bool) -> None:
+    """By SIGSTOP, or with its computer. Every module answers the first tick after that: nothing else tells of the time that is missing."""
+    pipeline = Pipeline([assemble_vehicle(load_vehicle("modcube"))], Parameters(), PERIOD_NS)
+    for tick in range(1, 160):
+        pipeline.step(resting(tick, [Request(Action.ARM, 0, True)] if tick == 100 else []))
+    back = 160 + round(gap_s / DT)
+    again = [pipeline.step(resting(tick, [Request(Action.ARM, 0, True)] if tick == back else [])) for tick in range(back, back + 100)]
+    assert {outputs.records[0].state for outputs in again} == {State.ARMED if is_armed else State.DISARMED}
+    assert any(has_power(outputs) for outputs in again) == is_armed
+    assert any("bus silent for" in event.text for event in again[0].events) == (not is_armed)
 
 
 def test_e_stop_that_only_the_module_of_one_body_has_heard_stops_every_body() -> None:
