@@ -15,9 +15,12 @@ from firmware_py.app.estop_note import estop_stands
 from firmware_py.app.firmware import Firmware
 from firmware_py.bus.codec import Codec
 from firmware_py.core.joints import joints_of, sides
+from firmware_py.core.transitions import ARMED
+from firmware_py.core.types import Mode
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.signals import read_attachment
 from firmware_py.runtime.flight_log import LoggedFrame, frame_of
+from firmware_py.runtime.log_end import last_bodies
 from firmware_py.runtime.log_folder import log_folders
 from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG
 
@@ -43,6 +46,8 @@ STOPPED = (
     "who arms, sends CLEAR_ESTOP, or without a ground station types modcube clear-estop FOLDER (that of --out) before the next start"
 )
 
+TESTED = "were armed, but not in flight, when the process before ended (a motor test): a person arms them"
+
 Face = tuple[int, int]
 """Fleet index and face."""
 
@@ -59,6 +64,8 @@ class LastFlight(NamedTuple):
     it did not fly."""
     stopped: bool = False
     """Whether an e-stop stands, from that process or an earlier one, that no person has cleared or armed after. Does not expire."""
+    grounded: frozenset[int] = frozenset()
+    """Numbers of the bodies that by their last record were not in flight, whatever their modules were told: a motor test arms too."""
 
     def docked(self, firmware: Firmware) -> frozenset[Face]:
         """Faces that are docked but belong to no joint of the fleet file."""
@@ -84,7 +91,7 @@ def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int, boot: str) -
         if sent is None:
             break
         if sent:
-            return _told(sent, _notes_of(folder), fleet, codec, boot)._replace(stopped=stopped)
+            return _told(sent, _notes_of(folder), fleet, codec, boot)._replace(stopped=stopped, grounded=_grounded(folder))
     return LastFlight(stopped=stopped)
 
 
@@ -103,8 +110,9 @@ def _is_recent(status: os.stat_result, now_ns: int) -> bool:
 def to_arm(before: LastFlight, firmware: Firmware, hold: bool, say: Callable[[str], None]) -> set[int]:
     """Modules to arm without a person: all with `hold`; with REARM, those that were in flight when the previous process was killed.
 
-    REARM arms none if modules were docked in flight: the fleet file has them apart, and its relays release them. Neither option arms any
-    if modules were undocked in flight, because the fleet file has them as one body that no longer exists, or if an e-stop stands.
+    A body in a motor test was not in flight: it may lie on a bench. REARM arms none if modules were docked in flight: the fleet file has
+    them apart, and its relays release them. Neither option arms any if modules were undocked in flight, because the fleet file has them as
+    one body that no longer exists, or if an e-stop stands.
     """
     fleet, docked, apart = firmware.fleet, before.docked(firmware), before.apart(firmware)
     for faces, what in ((docked, DOCKED_SINCE), (apart, PARTED_SINCE)):
@@ -118,9 +126,12 @@ def to_arm(before: LastFlight, firmware: Firmware, hold: bool, say: Callable[[st
         return set(range(len(fleet.module)))
     if docked or apart or not firmware.parameters.supervision.rearm:
         return set()
-    if before.armed:
+    tested = before.armed & {module for body in firmware.pipeline.bodies if body.index in before.grounded for module in body.modules}
+    if tested:
+        say(f"warning: modules {', '.join(map(fleet.label, sorted(tested)))} {TESTED}")
+    if before.armed - tested:
         say("the process before ended in flight: holding as soon as the vehicle may (REARM)")
-    return set(before.armed)
+    return set(before.armed - tested)
 
 
 def _told(sent: Sequence[LoggedFrame], notes: dict[str, Any], fleet: Fleet, codec: Codec, boot: str) -> LastFlight:
@@ -140,6 +151,15 @@ def _told(sent: Sequence[LoggedFrame], notes: dict[str, Any], fleet: Fleet, code
     open_before = frozenset((module, face) for module, face in notes.get("apart", ()) if module not in flown)
     let_go = frozenset() if _magnets_rest(notes) else frozenset(pulls) - pulling
     return LastFlight(flown if boot and notes.get("boot") == boot else frozenset(), pulling, let_go | open_before)
+
+
+def _grounded(folder: Path) -> frozenset[int]:
+    """Numbers of the bodies whose last record in a log is of a motor test, or disarmed. An unreadable log names none; nor does it tell of
+    the boot that `LastFlight.armed` needs."""
+    with suppress(OSError):
+        ends = last_bodies(folder / SIGNAL_LOG)
+        return frozenset(body for body, end in ends.items() if end.mode == Mode.MOTOR_DETECT or end.state not in ARMED)
+    return frozenset()
 
 
 def _magnets_rest(notes: dict[str, Any]) -> bool:

@@ -22,7 +22,7 @@ PACKAGE = "modcube"
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 """First and last bytes of a complete log (MCAP specification)."""
 
-_SPOILT = (McapError, EOFError, ValueError, struct.error, OverflowError, MemoryError)
+SPOILT = (McapError, EOFError, ValueError, struct.error, OverflowError, MemoryError)
 """Exceptions raised by reading a truncated log, or one in which a flipped bit makes a length astronomical."""
 
 Columns = dict[str, np.ndarray]
@@ -215,7 +215,7 @@ def log_records(path: Path) -> Iterator[Any]:
 def _records_of(log: IO[bytes]) -> Iterator[Any]:
     try:
         yield from StreamReader(log, validate_crcs=True).records
-    except _SPOILT:
+    except SPOILT:
         return  # truncated: the records before stay valid
 
 

@@ -23,7 +23,7 @@ from firmware_py.runtime.rate_keeper import LATENESS_EDGES_NS, RateKeeper
 from firmware_py.runtime.request_text import request_text
 
 TICKS, REQUESTS, DOCKS, EVENTS = "/firmware/ticks", "/firmware/requests", "/firmware/docks", "/events"
-TIMES, BUS = "/firmware/times", "/firmware/bus"
+TIMES, BUS, BODY = "/firmware/times", "/firmware/bus", "/firmware/body"
 
 
 def bus_topic(index: int) -> str:
@@ -38,7 +38,7 @@ def is_of_the_machine(topic: str) -> bool:
 
 def body_topic(index: int) -> str:
     """Topic of the body of that index."""
-    return f"/firmware/body{index}"
+    return f"{BODY}{index}"
 
 
 TICK_SIGNALS = (
