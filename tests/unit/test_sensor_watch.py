@@ -1,16 +1,20 @@
 """Samples of a frozen IMU and readings that leap are detected and not used; the body flies on without them."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+from scipy.special import ndtr
 
+from firmware_py.bus.codec import Codec
 from firmware_py.core.measurements import Measurements
 from firmware_py.core.rotations import difference
-from firmware_py.core.sensor_watch import LEAPS, REPEATS, SensorWatch
+from firmware_py.core.sensor_watch import AXIS_REPEATS, IMU_REPEATS, LEAPS, SENSOR_REPEATS, SensorWatch
 from firmware_py.core.types import Action, Mode, ModuleInputs, Request
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
+from hil.plant.spec import HALF_A_COUNT
 from tests.unit.tanks import PERIOD, Tank, single
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -19,6 +23,24 @@ PAIR = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2)
 
 def sample(value: float, accel: float = 9.8) -> ModuleInputs:
     return ModuleInputs(gyro=np.full(3, value), accel=np.full(3, accel))
+
+
+def flies_with_noise(tank: Tank, tamper: Callable[[ModuleInputs], None], mode: Mode) -> None:
+    """Arms the tank's module and flies it for a second in `mode`, with noisy sensors that `tamper` may change in every tick."""
+    rng, hear = np.random.default_rng(0), tank._hear
+
+    def heard(tick: int) -> list[ModuleInputs]:
+        (module,) = hear(tick)
+        assert module.gyro is not None and module.accel is not None and module.pressure_pa is not None
+        module.gyro, module.accel = module.gyro + 0.002 * rng.normal(size=3), module.accel + 0.03 * rng.normal(size=3)
+        module.pressure_pa += 20.0 * rng.normal()
+        tamper(module)
+        return [module]
+
+    tank._hear = heard  # type: ignore[method-assign]
+    tank.run(1.0)
+    tank.run(1.0, Request(Action.ARM))
+    tank.run(1.0, Request(Action.SET_MODE, 0, mode))
 
 
 def hears(watch: SensorWatch, *modules: ModuleInputs) -> bool:
@@ -33,13 +55,62 @@ def test_sample_that_is_repeated_ten_times_is_not_believed_until_it_changes() ->
     assert hears(watch, sample(0.2))
 
 
-@pytest.mark.parametrize("change", ["gyro", "accel"])
-def test_one_number_that_changes_is_a_sensor_that_lives(change: str) -> None:
+@pytest.mark.parametrize(("dead", "live"), [("gyro", "accel"), ("accel", "gyro")])
+def test_gyro_that_is_stuck_beside_a_live_accelerometer_is_not_believed_nor_the_reverse(dead: str, live: str) -> None:
+    watch, rng = SensorWatch([0]), np.random.default_rng(0)
+    heard = []
+    for _ in range(SENSOR_REPEATS + 3):
+        module = ModuleInputs(**{dead: np.zeros(3), live: 0.03 * rng.normal(size=3)})  # type: ignore[arg-type]
+        (left,) = watch.step([module])
+        assert (left.gyro is None) == (left.accel is None), "what is left of an IMU is not used alone"
+        heard.append(watch.imu_heard)
+    assert heard == [True] * SENSOR_REPEATS + [False] * 3
+    assert hears(watch, ModuleInputs(gyro=rng.normal(size=3) * 0.1, accel=rng.normal(size=3) * 0.1))
+
+
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("name", ["gyro", "accel"])
+def test_single_axis_that_is_stuck_is_found_too_though_later(name: str, axis: int) -> None:
+    watch, rng = SensorWatch([0]), np.random.default_rng(0)
+    heard = []
+    for _ in range(AXIS_REPEATS + 3):
+        module = ModuleInputs(gyro=0.002 * rng.normal(size=3), accel=0.03 * rng.normal(size=3))
+        getattr(module, name)[axis] = 0.1
+        heard.append(hears(watch, module))
+    assert heard == [True] * AXIS_REPEATS + [False] * 3
+
+
+def test_three_numbers_of_which_each_changes_now_and_then_are_a_sensor_that_lives() -> None:
     watch = SensorWatch([0])
-    for n in range(5 * REPEATS):
+    for n in range(5 * AXIS_REPEATS):
         module = sample(0.1)
-        getattr(module, change)[2] += 1e-9 * (n % 2)
+        assert module.gyro is not None and module.accel is not None
+        for axis in range(3):
+            still = (n + 5 * axis) // 15 % 2
+            module.gyro[axis] += 1e-9 * still
+            module.accel[axis] += 1e-9 * ((n // 9 + axis) % 2)
         assert hears(watch, module)
+
+
+def repeats_itself(counts: np.ndarray, repeats: int) -> float:
+    """Share of samples with which a run of `repeats` repetitions is complete; counts: (n, k) readings in counts, all k must repeat."""
+    same = np.cumsum(np.r_[0, (counts[1:] == counts[:-1]).all(axis=1)])
+    return float(np.mean(same[repeats:] - same[:-repeats] == repeats))
+
+
+def test_stillest_healthy_imu_is_taken_for_stuck_less_than_once_in_a_thousand_hours() -> None:
+    """The worst case: ideal sensors (half a count of noise) of a robot at rest, whose mean is the middle of a count on every axis."""
+    gyro, accel = (Codec.load().message(name).field_details[0].factor for name in ("GYRO", "ACCEL"))
+    assert HALF_A_COUNT["gyro_sigma"] == 0.5 * gyro and HALF_A_COUNT["accel_sigma"] == 0.5 * accel
+    edges = (np.arange(-7, 8) - 0.5) / 0.5
+    share = np.diff(ndtr(edges))
+    one = [float(np.sum(share ** (n + 1))) for n in range(AXIS_REPEATS + 1)]  # that n + 1 samples are equal
+    measured = np.rint(0.5 * np.random.default_rng(0).standard_normal((400_000, 3)))
+    for numbers, repeats in ((1, 10), (3, 4)):
+        np.testing.assert_allclose(repeats_itself(measured[:, :numbers], repeats), one[repeats] ** numbers, rtol=0.1)
+    samples = 1000 * 3600 * 400
+    alarms = samples * np.array([one[IMU_REPEATS] ** 6, 2 * one[SENSOR_REPEATS] ** 3, 6 * one[AXIS_REPEATS]])
+    assert alarms.sum() < 0.2, "of one module; less than 1 in a fleet of five"
 
 
 @pytest.mark.parametrize("broken", ["gyro", "accel"])
@@ -50,7 +121,7 @@ def test_imu_that_leaps_with_every_sample_is_not_heard(broken: str) -> None:
         module = sample(0.1 + 1e-3 * (n % 2))
         setattr(module, broken, rng.uniform(-16.0, 16.0, 3))
         is_heard = hears(watch, module)
-        assert n < REPEATS or not is_heard
+        assert n < IMU_REPEATS or not is_heard
 
 
 def test_pressure_that_is_repeated_for_two_seconds_is_not_believed_until_it_changes() -> None:
@@ -69,47 +140,40 @@ def test_pressure_that_is_repeated_for_two_seconds_is_not_believed_until_it_chan
 
 
 def test_blind_robot_whose_depth_sensor_freezes_comes_up_instead_of_drifting_at_a_depth_it_believes_in() -> None:
-    tank, rng, frozen_pa = Tank([single()]), np.random.default_rng(0), [0.0]
-    hear = tank._hear
+    tank, is_frozen = Tank([single()]), False
 
-    def heard(tick: int) -> list[ModuleInputs]:
-        (module,) = hear(tick)
-        assert module.gyro is not None and module.accel is not None and module.pressure_pa is not None
-        module.gyro, module.accel = module.gyro + 0.002 * rng.normal(size=3), module.accel + 0.03 * rng.normal(size=3)
-        module.pressure_pa = frozen_pa[0] or module.pressure_pa + 20.0 * rng.normal()
-        module.tags = [] if frozen_pa[0] else module.tags
-        return [module]
+    def freeze(module: ModuleInputs) -> None:
+        if is_frozen:
+            module.pressure_pa, module.tags = 1.1e5, []
 
-    tank._hear = heard  # type: ignore[method-assign]
-    tank.run(1.0)
-    tank.run(1.0, Request(Action.ARM))
-    tank.run(1.0, Request(Action.SET_MODE, 0, Mode.ALT_HOLD))
-    frozen_pa[0] = 1.1e5
+    flies_with_noise(tank, freeze, Mode.ALT_HOLD)
+    is_frozen = True
     assert tank.run(10.0).records[0].mode == Mode.SURFACE
 
 
 def test_lost_frames_neither_freeze_nor_thaw() -> None:
     watch = SensorWatch([0])
-    for _ in range(5 * REPEATS):
+    for _ in range(5 * IMU_REPEATS):
         assert not hears(watch, ModuleInputs())
     assert hears(watch, sample(0.1))
-    for n in range(2 * REPEATS + 1):
+    for n in range(2 * IMU_REPEATS + 1):
         watch.step([sample(0.1) if n % 2 == 0 else ModuleInputs()])
     assert not watch.imu_heard
-    assert not hears(watch, ModuleInputs(gyro=np.ones(3)))
+    assert not hears(watch, ModuleInputs())
     assert not hears(watch, sample(0.1))
+    assert not hears(watch, ModuleInputs(gyro=np.ones(3)))
 
 
 def test_each_module_is_watched_by_itself() -> None:
     watch = SensorWatch([2, 0])
-    for n in range(REPEATS + 1):
+    for n in range(IMU_REPEATS + 1):
         assert hears(watch, sample(0.1 * n), sample(9.0), sample(0.1))
     assert [module.gyro is None for module in watch.step([sample(2.0), sample(9.0), sample(0.1)])] == [False, False, True]
 
 
 def test_body_that_takes_over_knows_which_imu_is_frozen_and_what_was_believed_of_each() -> None:
     whole = SensorWatch([0, 1])
-    for n in range(REPEATS + 1):
+    for n in range(IMU_REPEATS + 1):
         whole.step([sample(0.1 * n), sample(0.1)])
     parts = SensorWatch([0]), SensorWatch([1])
     for part in parts:
@@ -125,13 +189,31 @@ def test_frozen_imu_is_left_out_of_the_mean() -> None:
     """The other IMU is 0.105 m off the centre of mass: a rate of 1 rad/s about each axis accelerates it by 0.21 m/s^2."""
     watch, fuse = SensorWatch(PAIR.modules), Measurements(PAIR, PERIOD).fuse
     both = fuse(watch.step([sample(1.0, 4.0), sample(3.0, 8.0)]), LEVEL)
-    for n in range(REPEATS + 1):
+    for n in range(IMU_REPEATS + 1):
         first = fuse(watch.step([sample(1.0, 4.0 + 1e-9 * (n % 2)), sample(3.0, 8.0)]), LEVEL)
-    for _ in range(REPEATS + 1):
+    for _ in range(IMU_REPEATS + 1):
         none = fuse(watch.step([sample(1.0, 4.0), sample(3.0, 8.0)]), LEVEL)
     assert both.gyro is not None and both.accel is not None and first.gyro is not None and first.accel is not None
     np.testing.assert_allclose([both.gyro[0], both.accel[0], first.gyro[0], first.accel[0]], [2.0, 6.0, 1.0, 4.0 - 0.21])
     assert none.gyro is None and none.accel is None
+
+
+@pytest.mark.parametrize("name", ["gyro", "accel"])
+def test_robot_whose_gyro_or_accelerometer_alone_goes_dead_keeps_upright(name: str) -> None:
+    """With a gyro that reads zeros it tumbled at 6 rad/s from the third second on."""
+    tank, is_dead, fastest = Tank([single()]), False, 0.0
+
+    def kill(module: ModuleInputs) -> None:
+        if is_dead:
+            setattr(module, name, np.zeros(3))
+
+    flies_with_noise(tank, kill, Mode.ALT_HOLD)
+    is_dead = True
+    for _ in range(600):
+        tank.run(0.01)
+        fastest = max(fastest, float(np.abs(tank.states[0][10:13]).max()))
+    assert fastest < 0.5
+    assert tank.outputs[-1].records[0].mode == Mode.POSHOLD, "as `imu_lost` wants it"
 
 
 @pytest.mark.slow
