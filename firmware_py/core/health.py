@@ -32,6 +32,9 @@ TAG_SHARE = 1.0 / 60.0
 """Weight of one tag observation in a one-second mean: tags come at 60 Hz."""
 UNSEEN_S = 0.5
 """Time without a tag after which the effect of a push counts as unobserved. Longer than the gaps that ordinary frame loss makes."""
+MOST_CURRENT_M_S = 10.0
+"""A faster current is no push but a false estimate, and leaves the mean as it is: with one NaN in it, no push would be noticed any more.
+Upon a module it would push with 2 kN; a hand or a wall does with 140 N, as 2.5 m/s would."""
 VOLTAGE_SHARE = 0.2
 """Weight of one supply voltage reading; they come at 10 Hz, which makes it a half-second mean."""
 
@@ -340,7 +343,8 @@ class HealthMonitor:
         missed = max(0, round(dt_s * 1e9 / self._period_ns) - 1)
         latest.missed_rate = keep * latest.missed_rate + missed / MEAN_S
         current_m_s = _current_m_s(*_pushed(estimate), *self._drag)
-        latest.push_m2_s2 += (1.0 - keep) * (current_m_s**2 - latest.push_m2_s2)
+        if abs(current_m_s) <= MOST_CURRENT_M_S:  # not where it is NaN
+            latest.push_m2_s2 += (1.0 - keep) * (current_m_s**2 - latest.push_m2_s2)
 
     def _judge_tags(self, estimate: Estimate, now: int) -> None:
         """Updates the means over the tags of about a second: NIS ratio, and share of refused tags."""
@@ -361,7 +365,7 @@ def _age_s(at_ns: int, now_ns: int) -> float:
 
 def _pushed(estimate: Estimate) -> tuple[float, float]:
     """Returns the horizontal disturbance force, N, and the speed over ground along it, m/s."""
-    (north_n, east_n, _), v_w = estimate.force_w.tolist(), rotate(estimate.q_wb, estimate.nu[:3].copy())
+    (north_n, east_n, _), v_w = estimate.force_w.tolist(), rotate(estimate.q_wb, estimate.nu[:3].copy()).tolist()
     push_n = math.hypot(north_n, east_n)
     return push_n, (north_n * v_w[0] + east_n * v_w[1]) / push_n if push_n > 0.0 else 0.0
 

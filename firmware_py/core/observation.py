@@ -17,6 +17,10 @@ from firmware_py.core.rotations import M, V, difference, rotate_back, skew, to_m
 GRAVITY = 9.80665
 """m/s^2, standard gravity."""
 ANY_NIS = math.inf
+MOST_SPEED_M_S, MOST_RATE_RAD_S = 10.0, 30.0
+"""A state beyond these has diverged, and the filter begins anew. No thruster vehicle swims faster than a few m/s, in currents of up to two;
+the GYRO frame ends at 16.4 rad/s about each axis, 28.4 in all. A robot that tumbled without a gyro did 7 rad/s; after a false depth the
+filter believed 1e160 m/s."""
 
 
 @njit(cache=True)
@@ -229,8 +233,10 @@ def are_finite(a, b):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def is_sound(x, variance):  # type: ignore[no-untyped-def]
-    """Whether every number of a state (32,) is finite, and every variance (6,) finite and not negative."""
-    return bool(are_finite(x, variance) and variance.min() >= 0.0)
+    """Whether a state (32,) is finite and its speed and rate are possible, and every variance (6,) is finite and not negative."""
+    speed = math.sqrt(x[7] ** 2 + x[8] ** 2 + x[9] ** 2)
+    rate = math.sqrt(x[10] ** 2 + x[11] ** 2 + x[12] ** 2)
+    return bool(are_finite(x, variance) and variance.min() >= 0.0 and speed <= MOST_SPEED_M_S and rate <= MOST_RATE_RAD_S)
 
 
 @njit(f"Tuple(({V},{V},boolean))({V},{M},{M},{M},float64,float64,{V},float64,float64,{PLANT})", cache=True)

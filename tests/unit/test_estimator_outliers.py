@@ -7,6 +7,8 @@ import pytest
 
 from firmware_py.core.body import Body
 from firmware_py.core.estimator import READY_AFTER, RESET_AFTER
+from firmware_py.core.observation import MOST_RATE_RAD_S, MOST_SPEED_M_S, is_sound
+from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import exp, multiply
 from firmware_py.core.types import Estimate
 from tests.unit.estimated_robot import DELAY_TICKS, P_WB, PERIOD, Q_WB, Robot, assert_rests, sensors, tag
@@ -95,6 +97,27 @@ def test_robot_that_was_seen_askew_is_upright_at_once_when_it_is_seen_well(body:
     assert estimate.rejected >= RESET_AFTER
     for _ in range(100):
         assert_rests(robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - PERIOD))))
+
+
+@pytest.mark.parametrize("speed", [1e3, -1e160])
+def test_filter_that_believes_a_speed_that_no_robot_has_begins_anew(body: Body, speed: float) -> None:
+    """A false depth once made it believe 1e160 m/s."""
+    robot = Robot(body)
+    robot.rest(101)
+    robot.estimator._anchor.x[8] = speed
+    estimate = robot.step(sensors())
+    assert not estimate.ready and np.isfinite(estimate.p_wb).all() and not estimate.nu.any()
+    estimate = robot.rest(5 * READY_AFTER)
+    assert estimate.ready
+    assert_rests(estimate, tolerance_m=0.02)
+
+
+@pytest.mark.parametrize(("first", "most"), [(7, MOST_SPEED_M_S), (10, MOST_RATE_RAD_S)])
+def test_robot_may_be_thrown_into_the_water_and_spin_but_not_beyond_what_its_gyro_can_tell(first: int, most: float) -> None:
+    x, share = np.eye(1, STATES, 3)[0], np.array([0.6, 0.0, -0.8])
+    for factor, is_possible in ((0.99, True), (1.01, False), (math.nan, False)):
+        x[first : first + 3] = factor * most * share
+        assert is_sound(x, np.ones(6)) == is_possible
 
 
 def test_good_tags_between_bad_ones_keep_the_pose(body: Body) -> None:

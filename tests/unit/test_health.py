@@ -414,6 +414,17 @@ def test_push_upon_a_body_under_way_is_no_more_current_than_there_is(speed_m_s: 
     assert heard.push_m_s == pytest.approx(current_m_s, rel=1e-3)
 
 
+@pytest.mark.parametrize("force_n", [math.nan, math.inf, 1e160, 1e6])
+@pytest.mark.parametrize("speed_m_s", [1e160, math.nan, 0.0])
+def test_push_that_nobody_could_believe_leaves_no_trace_in_the_mean(force_n: float, speed_m_s: float) -> None:
+    """One NaN stayed in the mean for the rest of the flight, and `pushed` acted never again."""
+    bench, current_m_s = MonitorBench(), 0.7
+    push_n = BODY.drag.mean * current_m_s**2
+    bench.step()
+    bench.step(force_w=np.array([force_n, 0.0, 0.0]), nu=np.array([speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    assert bench.wait(9.0, force_w=np.array([push_n, 0.0, 0.0])).push_m_s == pytest.approx(current_m_s, rel=1e-3)
+
+
 def test_push_upon_a_body_without_drag_is_no_current() -> None:
     bench = MonitorBench(dataclasses.replace(BODY, drag=dataclasses.replace(BODY.drag, nodes=0.0 * BODY.drag.nodes)))
     assert bench.wait(9.0, force_w=np.array([5.0, 0.0, 0.0])).push_m_s == 0.0
