@@ -18,6 +18,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.signals import read_signals
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import groups_of, passive_axes
 from firmware_py.runtime.recorder import CAN_LOG
 from hil.bench import DEFAULT_BUS, SCRIPTS, fleet_of, fly_scenario
 from hil.checks import RESULT_FILE, Limit, Result, judge, write_result
@@ -110,7 +111,7 @@ def judge_logs(
         wall_s: wall time of the whole run.
         lost_share: share of the ticks that may be missing from a log.
     """
-    whole = read_flight(folder)
+    whole = dataclasses.replace(read_flight(folder), passive=passive_in(scenario))
     period_ns, begin_ns = period_of(whole.ticks), begin_of(scenario, whole)
     flight = whole.between(begin_ns, begin_ns + scenario.task.duration_ns)
     share = len(flight.firmware["tick"]) / len(whole.firmware["tick"])
@@ -158,6 +159,15 @@ def _armed_at_all(scenario: Scenario, whole: Flight, folder: Path) -> list[Limit
     return [Limit("armed_share", low=ARMED_AT_ALL)]
 
 
+def passive_in(scenario: Scenario) -> tuple[int, ...]:
+    """Axes, 0 to 5, that the body which module 0 leads leaves to buoyancy."""
+    vehicles = {module.vehicle: load_vehicle(module.vehicle) for module in scenario.module}
+    if not any(vehicle.passive_dof for vehicle in vehicles.values()):
+        return ()
+    fleet = fleet_of(scenario, DEFAULT_BUS, 100)
+    return passive_axes(fleet, groups_of(fleet)[0], vehicles)
+
+
 def wanted_in(scenario: Scenario, flight: Flight, begin_ns: int) -> Poses | None:
     """Reference poses of the task, begun at `begin_ns`, in every tick of `flight`; None if the task is not a path."""
     if scenario.task.kind in SCRIPTS:
@@ -203,7 +213,7 @@ def start_of(flight: Flight) -> int:
 def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:
     """Writes plots and report.html of the run in `folder`; returns the report's path."""
     scenario = scenario.for_seed(result.seed)
-    flight = as_wanted(scenario, read_flight(folder))
+    flight = as_wanted(scenario, dataclasses.replace(read_flight(folder), passive=passive_in(scenario)))
     scene = _scene(scenario, flight)
     numbers = [module.number for module in scenario.module]
     plots = write_plots(flight, folder, scene.window, scene.tank_m, scene.force_limits_n, scene.paper_rmse_mm, numbers)

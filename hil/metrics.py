@@ -34,6 +34,8 @@ class Shown(NamedTuple):
     """Largest value that a flight can have, unscaled."""
 
 
+PASSIVE = {axis: f"passive_{AXES[axis]}_max_rad" for axis in (3, 4, 5)}
+"""Metrics by axis, 0 to 5, of a rotation that the vehicle leaves to buoyancy; only such a vehicle has them."""
 OUTCOMES = ("as asked", "jammed", "unstable control", "refused", "gave up")
 """Outcomes of a run's docks, indexed by the metric `outcome`."""
 SHOWN = {
@@ -41,6 +43,7 @@ SHOWN = {
     "position_max_m": Shown("Position error, largest", "mm", 1e3),
     "attitude_rmse_rad": Shown("Attitude RMSE, truth against reference", "deg", math.degrees(1.0)),
     "attitude_max_rad": Shown("Attitude error, largest", "deg", math.degrees(1.0)),
+    **{name: Shown(f"Passive {AXES[k]}, largest: not in the attitude errors", "deg", math.degrees(1.0)) for k, name in PASSIVE.items()},
     "estimate_position_rmse_m": Shown("Position RMSE, estimate against truth", "mm", 1e3),
     "estimate_attitude_rmse_rad": Shown("Attitude RMSE, estimate against truth", "deg", math.degrees(1.0)),
     "nis_mean": Shown("Tag NIS per degree of freedom (ideal: 1)"),
@@ -142,9 +145,30 @@ class Poses(NamedTuple):
 
 
 def errors(flight: Flight, wanted: Poses | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(k,) distance, m, and (k,) angle, rad, of the truth from `wanted`, by default from the firmware's own set-points."""
+    """(k,) distance, m, and (k,) angle, rad, of the truth from `wanted`, by default from the firmware's own set-points.
+
+    The angle leaves out rotations that the body leaves to buoyancy (`Flight.passive`).
+    """
+    off_m, off_rad = _offsets(flight, wanted)
+    off_rad[:, _passive_rotations(flight)] = 0.0
+    return np.linalg.norm(off_m, axis=1), np.linalg.norm(off_rad, axis=1)
+
+
+def _offsets(flight: Flight, wanted: Poses | None) -> tuple[np.ndarray, np.ndarray]:
+    """(k, 3) offset, world, m, and (k, 3) rotation vector, body, rad, of the truth from `wanted`, as in `errors`."""
     wanted = wanted or Poses(flight.firmware["setpoint_p_wb"], flight.firmware["setpoint_q_wb"])
-    return np.linalg.norm(flight.p_wb - wanted.p_wb, axis=1), np.linalg.norm(rotation_vectors(flight.q_wb, wanted.q_wb), axis=1)
+    return flight.p_wb - wanted.p_wb, rotation_vectors(flight.q_wb, wanted.q_wb)
+
+
+def _passive_rotations(flight: Flight) -> list[int]:
+    """Components of a rotation vector that the body leaves to buoyancy."""
+    return [axis - 3 for axis in flight.passive if axis in PASSIVE]
+
+
+def passive_words(flight: Flight) -> str:
+    """Words for a title of attitude errors: `, without passive pitch`; empty where all rotations count."""
+    names = [AXES[axis] for axis in flight.passive if axis in PASSIVE]
+    return f", without passive {' and '.join(names)}" if names else ""
 
 
 def flight_metrics(
@@ -164,7 +188,7 @@ def flight_metrics(
     """
     firmware = flight.firmware
     if not len(firmware["tick"]):
-        return dict.fromkeys((name for name in SHOWN if name not in DOCKING), math.nan)
+        return dict.fromkeys((name for name in SHOWN if name not in (*DOCKING, *PASSIVE.values())), math.nan)
     time_s = flight.time_s
     period_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else 0.0
     return _tracking(flight, wanted) | _estimation(flight) | {
@@ -190,6 +214,7 @@ def _tracking(flight: Flight, wanted: Poses | None) -> dict[str, float]:
         "position_max_m": float(error.max()),
         "attitude_rmse_rad": rms(angle),
         "attitude_max_rad": float(angle.max()),
+        **{PASSIVE[i + 3]: float(np.abs(_offsets(flight, wanted)[1][:, i]).max()) for i in _passive_rotations(flight)},
     }
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hil.metrics import errors, nis_mean, refused, rms, rotation_vectors
+from hil.metrics import errors, nis_mean, passive_words, refused, rms, rotation_vectors
 from hil.signals import Flight
 
 TRUTH, ESTIMATE, REFERENCE, COMMAND = "#0072b2", "#e69f00", "#30363d", "#009e73"
@@ -98,7 +98,8 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
     _path_3d(figure.add_subplot(grid[:, 0], projection="3d"), flight, tank_m, inside)
     time_s = flight.time_s
     error_m, angle_rad = errors(flight)
-    for row, (values, unit, what) in enumerate(((1e3 * error_m, "mm", "Position"), (np.degrees(angle_rad), "deg", "Attitude"))):
+    rows = ((1e3 * error_m, "mm", "Position", ""), (np.degrees(angle_rad), "deg", "Attitude", passive_words(flight)))
+    for row, (values, unit, what, without) in enumerate(rows):
         axes = figure.add_subplot(grid[row, 1])
         rmse = rms(values[inside])
         axes.plot(time_s, _once_placed(flight, values), color=TRUTH, linewidth=1.0)
@@ -106,7 +107,7 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
         if row == 0 and paper_rmse_mm is not None:
             paper = f"paper's robot, real tank: RMSE {paper_rmse_mm:g} mm"
             axes.axhline(paper_rmse_mm, color=AXIS_COLOURS[0], linestyle=":", linewidth=1.4, label=paper)
-        axes.set(title=f"{what} error, truth against reference", ylabel=unit)
+        axes.set(title=f"{what} error, truth against reference{without}", ylabel=unit)
         axes.set_ylim(0.0, 1.3 * max(float(values[inside].max()), *(line.get_ydata()[0] for line in axes.lines[1:])))
         _finish_time_axis(axes, flight, window, last=row == 1)
         axes.legend(handles=axes.lines[1:], loc="upper right", ncols=2, fontsize=9)

@@ -34,6 +34,8 @@ class Flight:
     ticks: Columns
     lost_ns: np.ndarray
     modules: tuple[Columns, ...] = ()
+    passive: tuple[int, ...] = ()
+    """Axes of the body, 0 to 5, that it leaves to buoyancy; rotations about them do not count as attitude error."""
 
     @property
     def time_s(self) -> np.ndarray:
@@ -63,7 +65,7 @@ class Flight:
         keep = (time_ns >= start_ns) & (time_ns <= end_ns)
         modules = tuple(rows_of(module, keep) for module in self.modules)
         lost_ns = self.lost_ns[(self.lost_ns >= start_ns) & (self.lost_ns <= end_ns)]
-        return Flight(rows_of(self.firmware, keep), rows_of(self.truth, keep), self.events, self.ticks, lost_ns, modules)
+        return Flight(rows_of(self.firmware, keep), rows_of(self.truth, keep), self.events, self.ticks, lost_ns, modules, self.passive)
 
 
 def rows_of(columns: Columns, which: np.ndarray) -> Columns:

@@ -50,6 +50,22 @@ class ThrusterSet:
     channel: np.ndarray
 
 
+def rank_by(values: np.ndarray) -> int:
+    """Rank of a matrix with these singular values, largest first."""
+    return int(np.sum(values > RANK_TOLERANCE * max(float(values[0]), 1e-12)))
+
+
+def rank_of(matrix: np.ndarray) -> int:
+    """Rank of a matrix that has no more than RANK_TOLERANCE of noise."""
+    return rank_by(np.linalg.svd(matrix, compute_uv=False))
+
+
+def can_make(matrix: np.ndarray, axis: int) -> bool:
+    """Whether thrusters of this (6, n) matrix can make a wrench along one axis, 0 to 5, alone."""
+    unit = np.eye(6)[axis]
+    return bool(np.linalg.norm(matrix @ np.linalg.lstsq(matrix, unit, rcond=RANK_TOLERANCE)[0] - unit) < RANK_TOLERANCE)
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DragTable:
     """Drag of a shape over flow direction, on the six sides of a cube (core.drag_lookup).
@@ -95,6 +111,7 @@ class Body:
         reach_m: largest distance of any point of its hulls from the centre of mass, m.
         cells: (m, 3) lattice cells; name: for display.
         faces: per module the kinds of its six faces, a letter each, as in the vehicle file (P probe, D drogue).
+        passive: wrench components, 0 to 5, that are left to buoyancy: no thruster is asked for them.
     """
 
     name: str
@@ -117,6 +134,7 @@ class Body:
     q_bt: np.ndarray
     supply_power_w: np.ndarray
     reach_m: float
+    passive: tuple[int, ...]
 
     @property
     def index(self) -> int:
@@ -128,6 +146,15 @@ class Body:
         """(m,) supply voltage of each module at which its thrusters' curves hold."""
         t = self.thrusters
         return np.array([t.voltage_v[t.module == m][0] for m in range(len(self.modules))])
+
+    @property
+    def steered_matrix(self) -> np.ndarray:
+        """(6, n) thruster matrix with zeros for passive axes that the thrusters could make alone. One that they cannot make alone keeps
+        its row, because it follows from the other axes.
+        """
+        matrix = self.thrusters.matrix.copy()
+        matrix[[axis for axis in self.passive if can_make(matrix, axis)]] = 0.0
+        return matrix
 
     @property
     def plant(self) -> Plant:

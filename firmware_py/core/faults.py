@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from firmware_py.core.body import RANK_TOLERANCE, Body
+from firmware_py.core.body import Body, rank_by, rank_of
 from firmware_py.core.missing_thrust import MissingThrust
 from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import polynomial
@@ -56,9 +56,9 @@ class ThrusterFaults(NamedTuple):
     dead: tuple[int, ...]
     """Indices of thrusters found dead or lying."""
     lost_axes: int
-    """Rank lost from the thruster matrix because of unusable thrusters."""
+    """Rank lost from the thruster matrix because of unusable thrusters; passive axes do not count."""
     keep: np.ndarray
-    """(6, 6) matrix that removes from a wrench what the usable thrusters cannot make."""
+    """(6, 6) matrix that removes from a wrench its passive axes and what the usable thrusters cannot make."""
 
 
 def _keep(made: np.ndarray, lost: np.ndarray) -> np.ndarray:
@@ -91,6 +91,7 @@ class FaultDetector:
     def __init__(self, body: Body, parameters: Faults, period_ns: int) -> None:
         t = body.thrusters
         self._t = t
+        self._passive = list(body.passive)
         self._thruster_at = by_channel(body)
         self._pairs = [{c: (at.get(c, -1), at.get(c + 1, -1)) for c in range(max(at) + 1)} for at in self._thruster_at]
         self._modules = body.modules
@@ -105,7 +106,7 @@ class FaultDetector:
         self._silence = [0] * len(body.modules)
         """Ticks that each module has been silent; counts down again while an excluded module is heard."""
         self._mute: list[int] = []
-        self._rank = int(np.linalg.matrix_rank(t.matrix, tol=RANK_TOLERANCE * np.linalg.norm(t.matrix, 2)))
+        self._rank = self._steered_rank(t.matrix)
         self._counts = np.zeros((n, len(WHY)), dtype=np.int64)
         self._heard, self._share = np.zeros((n, 2)), np.ones(n)
         self.words: list[str] = []
@@ -251,9 +252,15 @@ class FaultDetector:
     def _state_for(self, usable: np.ndarray) -> ThrusterFaults:
         alive = usable.copy()
         u, values, _ = np.linalg.svd(self._t.matrix * alive, full_matrices=alive.size < 6)  # u is (6, 6) even with fewer thrusters
-        rank = int(np.sum(values > RANK_TOLERANCE * max(float(values[0]), 1e-12)))
+        rank = rank_by(values)
         dead = tuple(int(i) for i in np.flatnonzero(~alive))
-        return ThrusterFaults(alive, dead, self._rank - rank, _keep(u[:, :rank], u[:, rank:]))
+        keep = _keep(u[:, :rank], u[:, rank:])
+        keep[:, self._passive] = 0.0
+        return ThrusterFaults(alive, dead, self._rank - self._steered_rank(self._t.matrix * alive), keep)
+
+    def _steered_rank(self, matrix: np.ndarray) -> int:
+        """Returns the rank of a (6, n) thruster matrix without its passive axes."""
+        return rank_of(np.delete(matrix, self._passive, axis=0))
 
 
 @njit(f"float64(float64,{V},float64)", cache=True)

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_py.core import rotations
-from firmware_py.core.body import ARM_SIGMA_M, BUOYANCY_SIGMA_N, TRIM_SIGMA_M, Body, ThrusterSet
+from firmware_py.core.body import ARM_SIGMA_M, BUOYANCY_SIGMA_N, TRIM_SIGMA_M, Body, ThrusterSet, can_make
 from firmware_py.core.observation import GRAVITY
 from firmware_py.core.types import CHANNELS
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle import AXES, Vehicle
 from firmware_py.prepare import drag_table
 from firmware_py.prepare.drag_cache import DragCache
 from firmware_py.prepare.joints import Placement, check_joints
@@ -120,6 +120,7 @@ def _body(placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: fl
     q_bm = np.array([QUATERNIONS[p.rotation] for p in placements])
     mass = _mass_matrix(balance, placements)
     tags = [(k, tag) for k, p in enumerate(placements) for tag in p.vehicle.tag]
+    thrusters = thruster_set(placements, r_bm)
     return Body(
         name=_name(placements),
         modules=modules,
@@ -133,7 +134,7 @@ def _body(placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: fl
         rigid_mass_kg=balance.mass_kg,
         righting=sum((_righting(p) for p in placements), np.zeros(3)),
         righting_sigma=_righting_sigma(placements, r_bm),
-        thrusters=thruster_set(placements, r_bm),
+        thrusters=thrusters,
         drag=drag_table.build(placements, balance.centre, pitch_m, cache),
         tag_ids=np.array([tag.id for _, tag in tags], dtype=np.int64),
         tag_module=np.array([k for k, _ in tags], dtype=np.int64),
@@ -141,7 +142,27 @@ def _body(placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: fl
         q_bt=np.array([_turned(q_bm[k], tag.quaternion) for k, tag in tags]).reshape(-1, 4),
         supply_power_w=np.array([_power(p.vehicle) for p in placements]),
         reach_m=max(_reach_m(p.vehicle, r) for p, r in zip(placements, r_bm, strict=True)),
+        passive=_passive(placements, thrusters.matrix),
     )
+
+
+def passive_axes(fleet: Fleet, members: Sequence[int], vehicles: Mapping[str, Vehicle]) -> tuple[int, ...]:
+    """`Body.passive` of the body of these modules, without the rest of its arrays."""
+    placements = place(*described(fleet, members, vehicles))
+    return _passive(placements, thruster_set(placements, Balance.of(placements, fleet.pitch_m).r_bm).matrix)
+
+
+def _passive(placements: Sequence[Placement], matrix: np.ndarray) -> tuple[int, ...]:
+    """Axes of the body that are left to buoyancy: those that its only module declares; for several modules, those that any of them
+    declares and that the thrusters of all together cannot make.
+    """
+    declared = sorted({_turned_axis(p.rotation, AXES.index(name)) for p in placements for name in p.vehicle.passive_dof})
+    return tuple(axis for axis in declared if len(placements) == 1 or not can_make(matrix, axis))
+
+
+def _turned_axis(rotation: int, axis: int) -> int:
+    """The axis of the body, 0 to 5, along or about which that axis of a module lies."""
+    return axis - axis % 3 + int(np.argmax(np.abs(MATRICES[rotation][:, axis % 3])))
 
 
 def _turned(q_bm: np.ndarray, q_mt: np.ndarray) -> np.ndarray:

@@ -77,7 +77,7 @@ def divide(body: Body, motion: np.ndarray) -> Division:
         motion: (k, 19) as for `wrenches`.
     """
     wanted = wrenches(body, motion)
-    left, sizes, _ = np.linalg.svd(body.thrusters.matrix)
+    left, sizes, _ = np.linalg.svd(body.steered_matrix)
     outside = left[:, int(np.sum(sizes > RANK_TOLERANCE * sizes[0])) :]
     if not outside.size:
         return Division(wanted, np.zeros(len(wanted)), np.zeros_like(wanted))

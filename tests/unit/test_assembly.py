@@ -14,9 +14,10 @@ from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.schema import DescriptionError, frozen_array
 from firmware_py.description.vehicle import Payload, Vehicle, load_vehicle
 from firmware_py.prepare import lattice
-from firmware_py.prepare.assembly import assemble, assemble_fleet, assemble_vehicle
+from firmware_py.prepare.assembly import assemble, assemble_fleet, assemble_vehicle, passive_axes
 
 PITCH = 0.21
+Cell = tuple[int, int, int]
 SHAPES = {
     "one": [(0, 0, 0)],
     "line of two": [(0, 0, 0), (1, 0, 0)],
@@ -314,6 +315,27 @@ def test_fleet_starts_as_its_file_says(modcube: Vehicle) -> None:
     bodies = assemble_fleet(Fleet(module=modules), {"modcube": modcube})
     assert [b.modules for b in bodies] == [(0, 2), (1,)]
     np.testing.assert_allclose(bodies[0].r_bm, [[0, -PITCH / 2, 0], [0, PITCH / 2, 0]], atol=1e-12)
+
+
+def test_passive_axis_turns_with_its_module() -> None:
+    """A quarter turn about the vertical makes the pitch of the module the roll of the body."""
+    bluerov, quarter = load_vehicle("bluerov2"), np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    turned = next(i for i, matrix in enumerate(lattice.MATRICES) if np.array_equal(matrix, quarter))
+    assert assemble_vehicle(bluerov).passive == (4,)
+    assert assemble([(0, 0, 0)], [turned], [bluerov]).passive == (3,)
+
+
+@pytest.mark.parametrize(("cells", "passive"), [([(0, 0, 0), (0, 1, 0)], (4,)), ([(0, 0, 0), (1, 0, 0)], ())], ids=["abreast", "in line"])
+def test_axis_of_an_assembly_is_passive_only_where_its_thrusters_cannot_make_it(cells: list[Cell], passive: tuple[int, ...]) -> None:
+    """Two BlueROV2 in line pitch by their vertical thrusters, two abreast do not."""
+    bluerov = dataclasses.replace(load_vehicle("bluerov2"), faces="PDPDPD")
+    assert assemble(cells, [0, 0], [bluerov] * 2, pitch_m=0.5).passive == passive
+    fleet = Fleet(module=tuple(Module(number=i + 1, body=0, cell=frozen_array(cell)) for i, cell in enumerate(cells)), pitch_m=0.5)
+    assert passive_axes(fleet, [0, 1], {fleet.module[0].vehicle: bluerov}) == passive
+
+
+def test_module_that_controls_every_axis_has_no_passive_one(modcube: Vehicle) -> None:
+    assert assemble_vehicle(modcube).passive == ()
 
 
 def test_vehicle_with_more_thrusters_than_its_frames_carry_cannot_fly(modcube: Vehicle) -> None:

@@ -6,6 +6,7 @@ import itertools
 import numpy as np
 import pytest
 
+from firmware_py.core.body import Body
 from firmware_py.core.faults import FaultDetector
 from firmware_py.core.pipeline import BodyPipeline
 from firmware_py.core.rotations import from_euler
@@ -71,3 +72,44 @@ def test_robot_of_five_thrusters_makes_the_force_that_it_can() -> None:
     thrust = pipeline._allocate(np.array([600.0, 100.0, 0.0, 0.0, 0.0, 0.0]), 0)
     np.testing.assert_allclose(thrust.achieved[:3], [269.1, 44.85, 0.0], atol=0.5)
     assert np.abs(thrust.achieved[3:]).max() < 1.0
+
+
+def leaving(name: str, *axes: str) -> Body:
+    """A shipped vehicle that leaves these axes to buoyancy."""
+    return assemble_vehicle(dataclasses.replace(load_vehicle(name), passive_dof=axes))
+
+
+def test_no_thruster_is_asked_for_a_moment_about_a_passive_axis() -> None:
+    """BlueROV2 Heavy could roll and pitch. The rest of the wrench stays as it is."""
+    pipeline = BodyPipeline(leaving("bluerov2_heavy", "roll", "pitch"), Parameters(), TICK_NS)
+    thrust = pipeline._allocate(np.array([3.0, 2.0, 1.0, 0.4, -0.5, 0.6]), 0)
+    np.testing.assert_allclose(thrust.achieved, [3.0, 2.0, 1.0, 0.0, 0.0, 0.6], atol=1e-9)
+    assert thrust.scale == (1.0, 1.0)
+
+
+@pytest.mark.parametrize(("name", "axis"), [("bluerov2", 4), ("girona500", 3)])
+def test_passive_axis_that_cannot_be_made_follows_from_the_others(name: str, axis: int) -> None:
+    body = assemble_vehicle(load_vehicle(name))
+    assert body.passive == (axis,)
+    keep = FaultDetector(body, Faults(), TICK_NS).now.keep
+    wanted = np.array([3.0, 2.0, 1.0, 0.4, -0.5, 0.6])
+    others = [k for k in range(6) if k != axis]
+    kept = keep @ wanted
+    np.testing.assert_allclose(kept[others], wanted[others], atol=1e-9)
+    np.testing.assert_allclose(body.thrusters.matrix @ body.thrusters.pinv @ kept, kept, atol=1e-9)
+    assert not keep[:, axis].any()
+    np.testing.assert_array_equal(body.steered_matrix, body.thrusters.matrix)
+
+
+@pytest.mark.parametrize(("passive", "lost"), [((), 1), (("sway",), 0)])
+def test_passive_axis_is_not_lost_with_a_thruster(passive: tuple[str, ...], lost: int) -> None:
+    """A diagonal horizontal pair of a BlueROV2 Heavy: what is left pushes surge and sway together, so one of them is lost."""
+    detector = FaultDetector(leaving("bluerov2_heavy", *passive), Faults(), TICK_NS)
+    usable = np.ones(8, dtype=bool)
+    usable[[0, 3]] = False
+    assert detector._state_for(usable).lost_axes == lost
+
+
+def test_mission_is_planned_without_moment_about_a_passive_axis() -> None:
+    np.testing.assert_array_equal(leaving("bluerov2_heavy", "roll").steered_matrix[3], 0.0)
+    assert np.linalg.matrix_rank(leaving("bluerov2_heavy", "roll").steered_matrix) == 5

@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.runtime.recorder import Recorder
 from hil.checks import Limit, check_metrics, judge, write_result
-from hil.flight import ticks_of
+from hil.flight import passive_in, ticks_of
 from hil.force_metrics import force_metrics
-from hil.metrics import Poses, flight_metrics, nis_mean, rate_rms, rotation_vectors, warnings
+from hil.metrics import Poses, flight_metrics, nis_mean, passive_words, rate_rms, rotation_vectors, shown, warnings
 from hil.scenario import load_scenario
 from hil.signals import Flight, read_flight
 from hil.truth_log import TruthRecorder
@@ -78,6 +78,22 @@ def test_tilted_robot_shows_its_angle(tmp_path: Path) -> None:
     metrics = flight_metrics(spiral_of(tmp_path, tilt_rad=(0.03, 0.0, -0.04), noise=0.0))
     assert metrics["attitude_rmse_rad"] == pytest.approx(0.05, abs=1e-9)
     assert metrics["attitude_max_rad"] == pytest.approx(0.05, abs=1e-9)
+
+
+def test_rotation_that_is_left_to_buoyancy_is_shown_by_itself_and_is_no_attitude_error(tmp_path: Path) -> None:
+    flight = dataclasses.replace(spiral_of(tmp_path, tilt_rad=(0.03, 0.2, 0.0), noise=0.0), passive=(4,))
+    metrics = flight_metrics(flight)
+    assert metrics["attitude_rmse_rad"] == metrics["attitude_max_rad"] == pytest.approx(0.03, abs=1e-9)
+    assert metrics["passive_pitch_max_rad"] == pytest.approx(0.2, abs=1e-9)
+    assert not {"passive_roll_max_rad", "passive_yaw_max_rad"} & set(metrics)
+    assert flight.between(START_NS, START_NS).passive == (4,)
+    assert passive_words(flight) == ", without passive pitch"
+    assert "not in the attitude errors" in shown("passive_pitch_max_rad").label
+
+
+@pytest.mark.parametrize(("vehicle", "passive"), [("bluerov2", (4,)), ("girona500", (3,)), ("modcube", ())])
+def test_judged_flight_leaves_out_the_rotation_that_its_vehicle_declares_passive(vehicle: str, passive: tuple[int, ...]) -> None:
+    assert passive_in(load_scenario("spiral").with_vehicle(vehicle)) == passive
 
 
 def test_every_tick_of_the_trajectory_counts(tmp_path: Path) -> None:
