@@ -90,8 +90,9 @@ def _escs(q: Question) -> str:
     return f"ESC {', '.join(str(i + 1) for i in q.health.esc_missing)} does not answer" if q.health.esc_missing else ""
 
 
-def _thrusters(q: Question) -> str:
-    return "the thrusters left cannot make every wrench" if q.health.lost_axes else ""
+def _thrusters(q: Question) -> list[str]:
+    reasons = [f"{axis} has no thrust: declare it in passive_dof of the vehicle file, or add thrusters" for axis in q.health.without_thrust]
+    return reasons + (["the thrusters left cannot make every wrench"] if q.health.lost_axes else [])
 
 
 def _failsafes(q: Question) -> list[str]:

@@ -5,6 +5,7 @@ Built by `prepare.assembly` from vehicle files; a merge or split swaps one Body 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -64,6 +65,23 @@ def can_make(matrix: np.ndarray, axis: int) -> bool:
     """Whether thrusters of this (6, n) matrix can make a wrench along one axis, 0 to 5, alone."""
     unit = np.eye(6)[axis]
     return bool(np.linalg.norm(matrix @ np.linalg.lstsq(matrix, unit, rcond=RANK_TOLERANCE)[0] - unit) < RANK_TOLERANCE)
+
+
+def axes_without_thrust(matrix: np.ndarray, passive: Sequence[int]) -> tuple[int, ...]:
+    """Axes, 0 to 5, that must be passive too before thrusters of this (6, n) matrix can make every wrench along the others.
+
+    Of the axes that depend on each other it takes the one that thrusters can make least; moments count by the thrusters' mean lever arm.
+    """
+    lever = float(np.sqrt(np.mean(np.sum(matrix[3:] ** 2, axis=0))))
+    scaled = matrix / np.repeat([1.0, lever if lever > 0.0 else 1.0], 3)[:, None]
+    left, found = [axis for axis in range(6) if axis not in passive], []
+    while left:
+        directions, values, _ = np.linalg.svd(scaled[left])
+        rank = rank_by(values)
+        if rank == len(left):
+            break
+        found.append(left.pop(int(np.argmax(np.linalg.norm(directions[:, rank:], axis=1)))))
+    return tuple(sorted(found))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,12 +12,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from firmware_py.core.body import Body
+from firmware_py.core.body import Body, axes_without_thrust
 from firmware_py.core.faults import ESC_DOWN, ThrusterFaults, by_channel
 from firmware_py.core.rotations import rotate
 from firmware_py.core.types import MCU_ESTOP, MCU_UNFIT, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import AXES
 
 NEVER_S = 1e9
 """Ages at or above this mean that nothing ever came."""
@@ -110,6 +111,8 @@ class Health(NamedTuple):
     """Modules of each joint that is open although it should hold."""
     push_m_s: float = 0.0
     """Speed of the current that would explain the estimated horizontal disturbance force; RMS over a second."""
+    without_thrust: tuple[str, ...] = ()
+    """Axes that no thruster of the body can push although the vehicle does not declare them passive."""
 
     @property
     def unseen_push_m_s(self) -> float:
@@ -167,6 +170,7 @@ class HealthMonitor:
         self._nominal_v = dict(zip(body.modules, body.nominal_v.tolist(), strict=True))
         self._drag = body.drag.mean, float(body.drag.linear[:3].mean())
         self._thruster_at = dict(zip(body.modules, by_channel(body), strict=True))
+        self._without_thrust = tuple(AXES[axis] for axis in axes_without_thrust(body.thrusters.matrix, body.passive))
         self._esc_ns = [NEVER_NS] * body.thrusters.module.size
         never = dict.fromkeys(body.modules, NEVER_NS)
         self._heard_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns = (never.copy() for _ in range(5))
@@ -275,6 +279,7 @@ class HealthMonitor:
             battery_age_s=(now - min(self._battery_ns.values())) * 1e-9,
             cabin_age_s=(now - min(self._cabin_ns.values())) * 1e-9,
             push_m_s=math.sqrt(latest.push_m2_s2),
+            without_thrust=self._without_thrust,
         )
 
     def _listen(self, modules: Sequence[ModuleInputs], now: int) -> None:

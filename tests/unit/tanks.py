@@ -12,7 +12,18 @@ from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import from_euler, multiply
 from firmware_py.core.transitions import State
-from firmware_py.core.types import RELAY_PUSH, Action, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
+from firmware_py.core.types import (
+    CHANNELS,
+    RELAY_PUSH,
+    Action,
+    DockFeedback,
+    EscFeedback,
+    Inputs,
+    ModuleInputs,
+    Outputs,
+    Request,
+    TagObservation,
+)
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.description.water import WATER_DENSITY
@@ -90,7 +101,7 @@ class Tank:
                 r_mb, heard = self.r_mb[n][k], modules[m]
                 heard.gyro, heard.accel = r_mb.apply(x[10:13]), r_mb.apply(felt)
                 heard.pressure_pa = 101_325.0 + WATER_DENSITY * 9.80665 * float((x[:3] + r_wb.apply(body.r_bi[k]))[2])
-                heard.voltage_v, heard.current_a, heard.leak, heard.cabin_temperature_c = 12.0, 3.0, False, 30.0
+                heard.voltage_v, heard.current_a, heard.leak, heard.cabin_temperature_c = float(body.nominal_v[k]), 3.0, False, 30.0
                 if tick % 10 == 0:
                     heard.esc = self._escs(n, k)
                 if tick % 2 == 0 and tick >= TAG_DELAY_TICKS:
@@ -101,7 +112,8 @@ class Tank:
         t = self.bodies[n].thrusters
         speed = np.sign(self.forces[n]) * t.rpm_at_full * np.sqrt(np.abs(self.forces[n]) / np.where(self.forces[n] > 0, 10.0, 8.0))
         rpm = [float(v) for v in speed[t.module == k]]
-        return [EscFeedback(i, (rpm[i], rpm[i + 1]), (1.0, 1.0), (0, 0)) for i in range(0, 8, 2)]
+        rpm += [0.0] * (CHANNELS - len(rpm))
+        return [EscFeedback(i, (rpm[i], rpm[i + 1]), (1.0, 1.0), (0, 0)) for i in range(0, CHANNELS, 2)]
 
     def _tag(self, n: int, k: int, tick: int) -> TagObservation:
         body, x = self.bodies[n], self.past[tick][n]

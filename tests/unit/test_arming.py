@@ -1,18 +1,25 @@
 """Arming checks: each alone, with its text and its boundary; which of them forced arming skips; and what each mode needs."""
 
+import dataclasses
 import math
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from firmware_py.core.arming import CHECKS, Question, against_arming, missing
+from firmware_py.core.body import axes_without_thrust
 from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
-from firmware_py.core.types import Mode
+from firmware_py.core.transitions import State
+from firmware_py.core.types import Action, Mode, Request
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Limiter, Parameters
+from firmware_py.description.vehicle import load_vehicle, vehicle_names
+from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.healths import BLIND, GOOD, UPRIGHT
+from tests.unit.tanks import Tank
 
 P = Parameters()
 PLACED = (Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.DOCK)
@@ -53,6 +60,7 @@ SOFT: list[tuple[Health, str]] = [
     (GOOD._replace(unfit=(0, 2)), "module 0, 2 starts, or has a fault"),
     (GOOD._replace(esc_missing=(0, 7)), "ESC 1, 8 does not answer"),
     (GOOD._replace(lost_axes=1), "the thrusters left cannot make every wrench"),
+    (GOOD._replace(without_thrust=("pitch",)), "pitch has no thrust: declare it in passive_dof of the vehicle file, or add thrusters"),
     (GOOD._replace(frame_errors_per_s=21.0), "21 bad frames a second, 20 permitted"),
     (GOOD._replace(topology="module 2 is not docked as configured"), "module 2 is not docked as configured"),
 ]
@@ -209,3 +217,41 @@ def test_sticks_steer_while_the_pilot_is_there(mode: Mode) -> None:
     assert missing(mode, GOOD._replace(pilot_age_s=above(1.0)), P) == gone
     assert missing(mode, GOOD._replace(pilot_age_s=math.nan), P) == [], "whoever was never heard is waited for, with neutral sticks"
     assert missing(mode, GOOD._replace(pilot_age_s=1.0), P) == []
+
+
+def tank_of(name: str, **changes: Any) -> Tank:
+    """A vehicle whose pose is known; those without tags get a BlueROV2's."""
+    vehicle = load_vehicle(name)
+    tank = Tank([assemble_vehicle(dataclasses.replace(vehicle, tag=vehicle.tag or load_vehicle("bluerov2").tag, **changes))])
+    tank.run(3.0)
+    return tank
+
+
+@pytest.mark.parametrize("name", ["bluerov2", "girona500", "modcube"])
+def test_shipped_vehicle_that_declares_its_passive_axis_is_armed(name: str) -> None:
+    assert tank_of(name).run(0.1, Request(Action.ARM)).records[0].state == State.ARMED
+
+
+@pytest.mark.parametrize(("name", "axis"), [("bluerov2", "pitch"), ("girona500", "roll")])
+def test_vehicle_with_an_axis_that_nothing_pushes_or_rights_is_not_armed(name: str, axis: str) -> None:
+    tank = tank_of(name, passive_dof=())
+    outputs = tank.run(0.1, Request(Action.ARM))
+    assert outputs.records[0].state == State.DISARMED
+    assert tank.pipeline.formation.pipelines[0].health.now.without_thrust == (axis,)
+    assert any(f"{axis} has no thrust: declare it" in event.text for made in tank.outputs for event in made.events)
+
+
+@pytest.mark.parametrize("name", vehicle_names())
+def test_no_shipped_vehicle_lacks_thrust(name: str) -> None:
+    body = assemble_vehicle(load_vehicle(name))
+    assert axes_without_thrust(body.thrusters.matrix, body.passive) == ()
+
+
+def test_every_axis_that_lacks_thrust_is_named_once_and_only_those() -> None:
+    matrix = np.zeros((6, 3))
+    matrix[0] = [1.0, 1.0, 0.0]
+    matrix[5] = [0.1, -0.1, 0.0]
+    matrix[2, 2] = 1.0
+    assert axes_without_thrust(matrix, ()) == (1, 3, 4)
+    assert axes_without_thrust(matrix, (3, 4)) == (1,)
+    assert axes_without_thrust(matrix, (1, 3, 4)) == ()
