@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from firmware_py.core.arming import Question, against_arming, missing
@@ -97,7 +97,7 @@ class Supervisor:
             if not estop:
                 self._say(CRITICAL, f"e-stop: module {', '.join(map(str, health.stopped))} says that it heard one")
             decisions.append(self._try(Trigger.ESTOP_FRAME, None, health))
-        decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger)]
+        decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger, health)]
         decisions += [self._request(request, health) for request in requests]
         decisions += self._run_failsafes(health)
         self._was_idle = self.state == State.DISARMED and not health.stopped and not self._estop_is_fresh(health)
@@ -187,24 +187,21 @@ class Supervisor:
         if guard == Guard.MODE_NEEDS:
             return missing(mode, health, self._p)
         holds = guard in (Guard.PARTING_PERMITTED, Guard.JOINT_OPEN) and modules_of(argument) not in health.open_joints
-        if guard == Guard.JOINT_OPEN and holds:
-            return ["the body is disarmed, and the joint is not open"]
+        if guard == Guard.JOINT_OPEN:
+            return ["the body is disarmed, and the joint is not open"] if holds else []
         if guard in IGNORED_FAILSAFES:
             ignored = IGNORED_FAILSAFES[Guard.MODE_PERMITTED if holds else guard]
             reasons = missing(mode, health, self._p) or self._failsafes.reasons_against(mode, health, ignored)
             if self._testing:  # a test armed the body, so the arming checks for flight have not run yet
                 reasons = reasons or self._reasons(Guard.ARMING_CHECKS, mode, health)
             return reasons
-        if guard == Guard.ESTOP_QUIET and self._estop_is_fresh(health):
-            return ["the e-stop is still raised"]
-        if guard == Guard.IN_MOTOR_DETECT and self.mode != Mode.MOTOR_DETECT:
-            return ["the mode is not MOTOR_DETECT"]
-        return []
+        is_met, words = OWN_STATE[guard]
+        return [] if is_met(self, health) else [words]
 
-    def _applies(self, trigger: Trigger) -> bool:
+    def _applies(self, trigger: Trigger, health: Health) -> bool:
         """Whether the trigger of an ended activity applies in the present state."""
         row = ROWS.get((self.state, trigger))
-        return row is not None and (self._testing if row.guard == Guard.TESTING else self.mode == Mode.DOCK)
+        return row is not None and not self._reasons(row.guard, self.mode, health)
 
     def retune(self, parameters: Parameters) -> None:
         """Changes the limits from this tick on; state and mode stay."""
@@ -241,3 +238,11 @@ class Supervisor:
 
 TAKES_OVER = (Effect.ENTER_MODE, Effect.ENTER_LEVEL, Effect.HOLD_AT, Effect.FOLLOW)
 """Effects that set how the body is steered, by a person's or a fail-safe's choice."""
+OWN_STATE: dict[Guard, tuple[Callable[[Supervisor, Health], bool], str]] = {
+    Guard.ALWAYS: (lambda supervisor, health: True, ""),
+    Guard.ESTOP_QUIET: (lambda supervisor, health: not supervisor._estop_is_fresh(health), "the e-stop is still raised"),
+    Guard.IN_MOTOR_DETECT: (lambda supervisor, health: supervisor.mode == Mode.MOTOR_DETECT, "the mode is not MOTOR_DETECT"),
+    Guard.IN_DOCK: (lambda supervisor, health: supervisor.mode == Mode.DOCK, "the mode is not DOCK"),
+    Guard.TESTING: (lambda supervisor, health: supervisor._testing, "no motor test armed the body"),
+}
+"""Guards that the supervisor's own state decides: whether each holds, and the reason in words if it does not."""

@@ -43,6 +43,15 @@ def test_every_trigger_without_a_row_is_refused_in_words(state: State, trigger: 
     assert supervisor.state == state
 
 
+@pytest.mark.parametrize("guard", [guard for guard in Guard if guard != Guard.ALWAYS], ids=lambda guard: guard.name)
+def test_guard_that_does_not_hold_says_why_whatever_row_names_it(guard: Guard) -> None:
+    """Two guards were obeyed only where an activity ends by itself; in any other row they would have let everything pass."""
+    supervisor = supervisor_in()
+    supervisor.step(True, BLIND, [])
+    assert supervisor._reasons(guard, Mode.POSHOLD, BLIND, DOCK)
+    assert not supervisor._reasons(Guard.ALWAYS, Mode.POSHOLD, BLIND, DOCK)
+
+
 def test_robot_starts_disarmed_and_would_hold_its_place() -> None:
     supervisor = Supervisor(P)
     assert (supervisor.state, supervisor.mode, supervisor.level) == (State.DISARMED, Mode.POSHOLD, Level.NONE)
