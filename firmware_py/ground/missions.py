@@ -22,6 +22,7 @@ _ASKED_ALIKE = 4
 answer it with float32 degrees, which resolve a place to a metre, or refuse it.
 """
 _FLIES = "it flies, and is not changed in part"
+_SENDING = "another station is sending one"
 _IMMEDIATE_CURRENT = (2, 3)
 """Values of `current` in an item outside a mission: ArduPilot's way to go to a place or to an altitude at once."""
 
@@ -129,7 +130,12 @@ class MissionService:
         """Returns why this client may not upload a mission now; empty if it may."""
         if self._system.is_ambiguous_broadcast(arrival):
             return "it is for all, and there are several bodies"  # they would fly to the same place
-        return "another station is sending one" if self._upload is not None and not _same(self._upload.arrival, arrival) else ""
+        return _SENDING if self._upload is not None and not _same(self._upload.arrival, arrival) else ""
+
+    def _is_of_another_station(self, arrival: Arrival, upload: _Upload) -> bool:
+        """Whether a message comes from another station than an upload: another sender, or its namesake on another channel that is there."""
+        other_channel = arrival.channel != upload.arrival.channel and upload.arrival.channel in self._system.channels
+        return other_channel or not _same(upload.arrival, arrival)
 
     def _deny(self, arrival: Arrival, kind: int, reason: str) -> None:
         self._system.say(WARNING, f"mission refused: {reason}")
@@ -187,6 +193,9 @@ class MissionService:
     def _clear(self, arrival: Arrival) -> None:
         kind = arrival.message["mission_type"]
         if kind in (_MISSION, 255):
+            if self._upload is not None and self._is_of_another_station(arrival, self._upload):
+                self._deny(arrival, kind, _SENDING)
+                return
             self._upload = self._ended = None
             self._flight.replace(())
         self._acknowledge(arrival, _ACCEPTED, kind)

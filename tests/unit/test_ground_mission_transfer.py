@@ -101,6 +101,34 @@ def test_station_that_sends_a_mission_while_another_one_does_is_denied_in_words(
     assert other.texts == "mission refused: another station is sending one"
 
 
+@pytest.mark.parametrize("system", [254, 255], ids=["another", "of the same number"])
+def test_mission_that_is_being_sent_is_not_cleared_by_another_station(world: World, client: Client, system: int) -> None:
+    """It would end without a word to its sender, which waits for requests of items that never come."""
+    other = world.client(system)
+    client.send("MISSION_COUNT", 1, 1, 2, 0)
+    other.send("MISSION_CLEAR_ALL", 1, 1, 0)
+    world.run(1)
+    assert [ack.type for ack in other.all("MISSION_ACK")] == [mavlink.MAV_MISSION_DENIED]
+    assert other.texts == "mission refused: another station is sending one"
+    for number in range(2):
+        client.send("MISSION_ITEM_INT", *item(number, PLACES[number]), 0)
+        world.run(1)
+    assert [ack.type for ack in client.all("MISSION_ACK")] == [mavlink.MAV_MISSION_ACCEPTED]
+    other.send("MISSION_CLEAR_ALL", 1, 1, 0)
+    world.run(1)
+    assert other.last("MISSION_ACK").type == mavlink.MAV_MISSION_ACCEPTED and not world.station.services[1].flight.items
+
+
+def test_station_clears_the_mission_that_it_is_sending_itself_over_a_new_link_too(world: World, client: Client) -> None:
+    client.send("MISSION_COUNT", 1, 1, 2, 0)
+    world.run(1)
+    world.station.leave(client.channel)
+    again = world.client()
+    again.send("MISSION_CLEAR_ALL", 1, 1, 0)
+    world.run(1)
+    assert [ack.type for ack in again.all("MISSION_ACK")] == [mavlink.MAV_MISSION_ACCEPTED]
+
+
 @pytest.mark.parametrize("current", [2, 3])
 @pytest.mark.parametrize("name", ["MISSION_ITEM", "MISSION_ITEM_INT"])
 def test_item_that_is_a_place_to_go_to_at_once_is_refused_and_told_of(world: World, client: Client, name: str, current: int) -> None:
