@@ -109,8 +109,10 @@ def _fault(item: Item) -> int:
     if item.is_place:
         if item.frame not in (*ABSOLUTE, *RELATIVE):
             return UNSUPPORTED_FRAME
-        if abs(item.x) > 900_000_000 or abs(item.y) > 1_800_000_000:
+        if abs(item.x) > 900_000_000:
             return INVALID_X
+        if abs(item.y) > 1_800_000_000:
+            return INVALID_Y
         if not math.isfinite(item.z) or abs(item.z) > 11_000:
             return INVALID_Z
         if math.isfinite(item.parameters[0]) and not 0 <= item.parameters[0] <= _LONGEST_S:

@@ -18,6 +18,8 @@ from tests.unit.ground_world import Client, World
         (item(0, (1000, 1000, -0.4), frame=1), mavlink.MAV_MISSION_UNSUPPORTED_FRAME),
         (item(0, PLACES[0], command=22), mavlink.MAV_MISSION_UNSUPPORTED),
         (item(0, (2**31 - 1, 0, -0.4)), mavlink.MAV_MISSION_INVALID_PARAM5_X),
+        (item(0, (0, 2**31 - 1, -0.4)), mavlink.MAV_MISSION_INVALID_PARAM6_Y),
+        (item(0, (900_000_001, -1_800_000_001, -0.4)), mavlink.MAV_MISSION_INVALID_PARAM5_X),
         (item(0, (0, 0, NAN)), mavlink.MAV_MISSION_INVALID_PARAM7),
         (item(0, PLACES[0], p=(-1, 0, 0, 0)), mavlink.MAV_MISSION_INVALID_PARAM1),
         (item(0, (0, 0, 0), command=178, frame=2, p=(2, 0.5, -1, 0)), mavlink.MAV_MISSION_INVALID_PARAM1),
