@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -131,8 +132,10 @@ class LogService:
     def _find(self) -> list[Path]:
         if self._folder is None:
             return []
-        try:
-            found = [path for path in self._folder.rglob("*") if path.suffix in _SUFFIXES and path.is_file()]
-            return sorted(found, key=lambda path: path.stat().st_mtime)[-_MOST_LOGS:]
-        except OSError:
-            return []
+        found: list[tuple[float, Path]] = []
+        with suppress(OSError):  # of the folder itself
+            for path in self._folder.rglob("*"):
+                with suppress(OSError):  # a file that has just been deleted
+                    if path.suffix in _SUFFIXES and path.is_file():
+                        found.append((path.stat().st_mtime, path))
+        return [path for _, path in sorted(found)[-_MOST_LOGS:]]

@@ -21,6 +21,27 @@ def test_each_of_two_clients_has_its_list_of_logs(tmp_path: Path) -> None:
     assert [len(client.all("LOG_ENTRY")) for client in clients] == [25, 25]
 
 
+def test_log_that_is_deleted_while_the_folder_is_listed_hides_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for number in range(3):
+        (tmp_path / f"{number}.log").touch()
+    look = Path.stat
+
+    def look_or_miss(path: Path, **more: bool) -> os.stat_result:
+        """The second look at a file: after `is_file`."""
+        looks[path] = looks.get(path, 0) + 1
+        if path.name == "1.log" and looks[path] > 1:
+            raise FileNotFoundError(path)
+        return look(path, **more)
+
+    looks: dict[Path, int] = {}
+    monkeypatch.setattr(Path, "stat", look_or_miss)
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    client = world.client()
+    client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(5)
+    assert [entry.num_logs for entry in client.all("LOG_ENTRY")] == [2, 2]
+
+
 def test_each_of_two_clients_has_the_log_that_it_fetches(tmp_path: Path) -> None:
     """A LOG_REQUEST_END from a third client ends neither transfer."""
     data = bytes(i % 251 for i in range(20_000))
