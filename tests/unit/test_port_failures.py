@@ -97,6 +97,33 @@ class WireLink(Link):
         return self.same
 
 
+class SlowLink(WireLink):
+    """Takes until the port is being closed to let go of a bus."""
+
+    def __init__(self):
+        super().__init__()
+        self.lets_go, self.port = threading.Event(), None
+
+    def close(self, bus):
+        self.lets_go.set()
+        while not self.port._closed:
+            time.sleep(0.001)
+        super().close(bus)
+
+
+def test_port_that_is_closed_while_its_bus_dies_ends_its_reader_quietly():
+    """An exception there is written to the console of a vehicle that ends as it should, and in a test it is a failure."""
+    link = SlowLink()
+    link.port = port = Port("wire:", link, True, None, threading.Event())
+    link.wires[0].sends.append(OSError(errno.ENODEV, "gone"))
+    port.send(FRAMES[0])
+    assert link.lets_go.wait(5.0)
+    port.close()
+    assert not port._thread.is_alive()
+    with pytest.raises(PortError, match="is closed"):
+        port.receive()
+
+
 @pytest.fixture
 def link():
     return WireLink()

@@ -89,9 +89,9 @@ class Port:
 
     def receive(self) -> list[Frame]:
         """Returns all available frames in order; without a reader this also reopens an interface that came back."""
+        self._refuse_if_closed()
         if self._thread is None:
             return self._drain(0.0)
-        self._refuse_if_closed()
         waiting, frames = self._waiting, []
         while waiting:
             frames.append(waiting.popleft())
@@ -159,8 +159,7 @@ class Port:
         frames: list[Frame] = []
         bus = self._bus
         if bus is None:
-            self._refuse_if_closed()
-            self._reopen()
+            self._reopen()  # even while `close` waits for the reader: it then closes what was opened
             return frames
         try:
             for item in self._link.waiting(bus, timeout_s):
