@@ -121,6 +121,8 @@ class MissionFlight:
         self._hold_by_tick = 0
         self._speed: float | None = None
         self._repeat: list[tuple[int, int]] = []
+        """Number and time of each repeat of MISSION_ITEM_REACHED that is due. Only the newest item is repeated: MAVSDK takes the one that
+        it heard of last for the farthest."""
 
     # ------------------------------------------------------------ requests
 
