@@ -124,6 +124,8 @@ class Faults:
     def add(self, fault: Fault) -> None:
         """Adds a fault live. Raises DescriptionError for one that would have no effect."""
         thrusters = {number: len(self._world.vehicles[mcu.module].thruster) for number, mcu in self._nodes.mcus.items()}
+        if not thrusters:
+            raise DescriptionError(f"fault.kind: no MCU of the plant's own is there for {fault.kind}; C nodes have no faults")
         for key, what in fault.mistakes(thrusters):
             raise DescriptionError(f"fault.{key}: {what}")
         self._faults.append(fault)

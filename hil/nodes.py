@@ -6,7 +6,7 @@ command, samples its sensors and answers, MCU_STATUS last. This code is independ
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from typing import Protocol
 
 from firmware_py.bus.codec import Codec, Frame, MessageCodec, Receiver
@@ -252,10 +252,13 @@ class Nodes:
         self.watch()
         return self.answer(frames, self.world.time_ns) + self.faults.intruders(self.world.time_ns)
 
-    def refuse_others(self, frames: Iterable[Frame], address: str) -> None:
-        """Raises DescriptionError when a frame received at `address` is the MCU_STATUS of an MCU that is simulated here."""
+    def refuse_others(self, frames: Iterable[Frame], address: str, numbers: Container[int] | None = None) -> None:
+        """Raises DescriptionError when a frame received at `address` is the MCU_STATUS of an MCU that is simulated here: one of `numbers`,
+        by default of `mcus`.
+        """
+        simulated = self.mcus if numbers is None else numbers
         for frame in frames:
-            if (number := self._statuses.get(frame.id)) in self.mcus:
+            if (number := self._statuses.get(frame.id)) is not None and number in simulated:
                 who = f"somebody else answers as module {number} on {address}"
                 raise DescriptionError(f"{who}: another plant, or the robot itself; end it, or take another --bus")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Sequence
 
+from firmware_py.description.schema import DescriptionError
 from hil.nodes import SLOW, Mcu, Nodes
 from hil.scenario import Scenario
 
@@ -77,7 +78,13 @@ def place(readings: Readings, name: str, values: Sequence[float]) -> None:
 
 
 def take_boards(nodes: Nodes, scenario: Scenario, rate_hz: int) -> dict[int, Board]:
-    """Returns boards for the modules of `nodes`, by number, and removes the plant's own MCUs from `nodes`."""
+    """Returns boards for the modules of `nodes`, by number, and removes the plant's own MCUs from `nodes`.
+
+    Raises DescriptionError for a scenario with faults: they are injected in the plant's own MCUs and on their wire, and would do nothing.
+    """
+    if scenario.fault:
+        kinds = ", ".join(dict.fromkeys(fault.kind for fault in scenario.fault))
+        raise DescriptionError(f"scenario {scenario.name}: C nodes have no faults ({kinds}); leave them out, or fly the plant's own nodes")
     tick_ns = NS_PER_S // rate_hz
     boards = {
         number: Board(nodes.codec, number, mcu.module, nodes.world, scenario.sensors, tick_ns)

@@ -84,8 +84,8 @@ class CNodes:
         return answers
 
     def refuse_others(self, frames: Iterable[Frame], address: str) -> None:
-        """As `Nodes.refuse_others`, for the modules that are not run by C nodes."""
-        self._nodes.refuse_others(frames, address)
+        """As `Nodes.refuse_others`."""
+        self._nodes.refuse_others(frames, address, self.c_nodes)
 
     def watch(self) -> None:
         """As `Nodes.watch`."""

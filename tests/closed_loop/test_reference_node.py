@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import shutil
 import subprocess
 import sys
@@ -17,8 +18,11 @@ from firmware_py.app.firmware import BusFrame
 from firmware_py.bus.codec import Frame
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.schema import DescriptionError
 from hil.bench import Bench, open_bench
+from hil.faults import Faults
 from hil.nodes import make_nodes
+from hil.plant.fault_spec import Fault
 from hil.reference_node import CNodes, load_library
 from hil.scenario import make_world
 from tests.closed_loop.flights import shortened
@@ -72,6 +76,30 @@ def nodes(library: CDLL) -> CNodes:
     scenario = shortened("hover", 1.0)
     world = make_world(scenario, 0, PERIOD_NS)
     return CNodes(make_nodes(world, CODEC, scenario), scenario, library, RATE_HZ)
+
+
+def test_scenario_with_faults_is_refused_for_c_nodes(library: CDLL) -> None:
+    """They would do nothing, and a robot that bears them would have passed."""
+    scenario = dataclasses.replace(shortened("hover", 1.0), fault=(Fault(kind="leak", at_s=0.0), Fault(kind="frame_loss", value=0.3)))
+    world = make_world(scenario, 0, PERIOD_NS)
+    with pytest.raises(DescriptionError, match=r"C nodes have no faults \(leak, frame_loss\); leave them out"):
+        CNodes(make_nodes(world, CODEC, scenario), scenario, library, RATE_HZ)
+
+
+def test_fault_is_refused_in_a_flight_of_c_nodes_too(library: CDLL) -> None:
+    scenario = shortened("hover", 1.0)
+    own = make_nodes(make_world(scenario, 0, PERIOD_NS), CODEC, scenario)
+    faults = Faults(own)
+    CNodes(own, scenario, library, RATE_HZ)
+    with pytest.raises(DescriptionError, match="C nodes have no faults"):
+        faults.add(Fault(kind="leak", at_s=0.0))
+
+
+def test_robot_on_the_bus_that_answers_as_a_c_node_is_noticed(nodes: CNodes) -> None:
+    answers = nodes.step([sync(1)])
+    with pytest.raises(DescriptionError, match="somebody else answers as module 1 on can0"):
+        nodes.refuse_others(answers, "can0")
+    nodes.refuse_others([sync(1)], "can0")
 
 
 def status(frames: Sequence[Frame]) -> tuple[int, int, int]:
