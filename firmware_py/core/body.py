@@ -127,6 +127,7 @@ class Body:
         tag_module and r_bt follow the order of tag_ids.
         supply_power_w: (m,) power that each module's supply can give to its thrusters and magnets.
         reach_m: largest distance of any point of its hulls from the centre of mass, m.
+        depth_rating_m: largest depth that all its vehicles are made for, m.
         cells: (m, 3) lattice cells; name: for display.
         faces: per module the kinds of its six faces, a letter each, as in the vehicle file (P probe, D drogue).
         passive: wrench components, 0 to 5, that are left to buoyancy: no thruster is asked for them.
@@ -153,6 +154,7 @@ class Body:
     supply_power_w: np.ndarray
     reach_m: float
     passive: tuple[int, ...]
+    depth_rating_m: float
 
     @property
     def index(self) -> int:

@@ -27,9 +27,12 @@ from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rigid_body import restoring_moment
 from firmware_py.core.rotations import heading, multiply, rotate, to_matrix
 from firmware_py.core.topology import Motion, down_of
-from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
+from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, ExpectedDepth, Measured
 from firmware_py.description.parameters import Estimation
 
+TAG_FRESH_NS = 1_000_000_000
+"""Age up to which a tag tells the depth: until then gyro and accelerometer carry it on to a few centimetres. The fail-safe `tag_late`
+takes as long."""
 READY_AFTER = 10
 """Tag observations to accept before the pose counts as valid."""
 UNKNOWN_SIGMA = np.full(6, 1e3)
@@ -95,7 +98,7 @@ class Estimator:
         self._forget()
         self.retune(parameters)
         self._refused_in_row = 0
-        self._rejected = 0
+        self._rejected, self._depth_variance = 0, math.inf
         self._last_tag_ns, self._last_accept_ns = NEVER_NS, 0
         self._tag_agreement, self._last_accel_ns, self._last_depth_ns = TagAgreement(), 0, 0
         self._nis = math.nan
@@ -118,6 +121,13 @@ class Estimator:
     def q_wb(self) -> np.ndarray:
         """Latest attitude, (4,)."""
         return np.asarray(self._now[3:7])
+
+    def expected_depth(self, time_ns: int) -> ExpectedDepth | None:
+        """Returns what the body's depth sensors are to tell at `time_ns`; None unless tags tell the depth."""
+        if self._accepted < READY_AFTER or time_ns - self._last_tag_ns > TAG_FRESH_NS:
+            return None
+        sigma_m = math.sqrt(self._depth_variance + self._head.covariance[24, 24] + self._p.depth_sigma_m**2)
+        return ExpectedDepth(float(self._now[2] + self._now[25]), sigma_m, to_matrix(self.q_wb)[2].tolist())
 
     def step(self, time_ns: int, measured: Measured, tau: np.ndarray) -> Estimate:
         """Returns the estimate at `time_ns`.
@@ -324,6 +334,7 @@ class Estimator:
         if not sound:  # a sensor gave false readings
             self._forget()
             sigma = UNKNOWN_SIGMA
+        self._depth_variance = float(sigma[2]) ** 2
         x = self._now.copy()
         return Estimate(
             p_wb=x[:3],

@@ -171,6 +171,7 @@ def take_over(pipeline: BodyPipeline, before: Sequence[BodyPipeline], time_ns: i
     for other in before:
         _take_forces(pipeline, other)
     pipeline.sensors.take_over([other.sensors for other in before])
+    pipeline.depth_gate.take_over([other.depth_gate for other in before])
     pipeline.faults.take_over([other.faults for other in before])
     pipeline.allocator.set_alive(pipeline.faults.now.alive)
     pipeline.health.take_over([other.health for other in before])

@@ -61,6 +61,9 @@ class TagOnlyEstimator:
         """(4,) latest attitude."""
         return self._q_wb
 
+    def expected_depth(self, time_ns: int) -> None:
+        """No depth: this filter takes none."""
+
     @property
     def motion(self) -> Motion:
         """Current state and covariance, for a body that docks or undocks. Biases and disturbance, which this filter does not estimate,

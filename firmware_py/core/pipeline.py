@@ -12,6 +12,7 @@ import numpy as np
 from firmware_py.core.allocator import Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.controller import Controller
+from firmware_py.core.depth_gate import DepthGate
 from firmware_py.core.docking import DockingStage, tag_table
 from firmware_py.core.estimator import Estimator
 from firmware_py.core.faults import FaultDetector
@@ -62,6 +63,7 @@ class BodyPipeline:
         self.joints = joints_of(body)
         self._holding = holding(body, self.joints)
         self.sensors = SensorWatch(body.modules)
+        self.depth_gate = DepthGate(body)
         self.measurements = Measurements(body, period_ns)
         self.estimator = ESTIMATORS[parameters.estimation.kind](body, parameters.estimation, period_ns)
         self.faults = FaultDetector(body, parameters.faults, period_ns)
@@ -99,7 +101,10 @@ class BodyPipeline:
         self.supply.step(inputs.modules)
         mean_n = self.lag.step()
         believed = self.sensors.step(inputs.modules)
-        self.health.imu_heard, self.health.pressure_heard = self.sensors.imu_heard, self.sensors.pressure_heard
+        if self.sensors.pressure_heard:
+            believed = self.depth_gate.step(believed, self.estimator.expected_depth(inputs.time_ns), self.supervisor.armed)
+        self.health.imu_heard = self.sensors.imu_heard
+        self.health.pressure_heard = self.sensors.pressure_heard and self.depth_gate.heard
         measured = self.measurements.fuse(believed, self.estimator.q_wb)
         estimate = self.estimator.step(inputs.time_ns, measured, self.body.thrusters.matrix.dot(mean_n))
         self._find_faults(inputs, measured, estimate, mean_n)

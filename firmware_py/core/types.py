@@ -6,6 +6,7 @@ One tick: Inputs -> (Estimate, Setpoint, Wrench, Thrust per body) -> Outputs. Wo
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -215,6 +216,17 @@ class Measured(NamedTuple):
     depth_m: float | None
     """Depth of the centre of mass from pressure, without the datum's bias."""
     tags: list[BodyPose]
+
+
+class ExpectedDepth(NamedTuple):
+    """What the estimate says that depth sensors must tell."""
+
+    depth_m: float
+    """Depth of the centre of mass, with the datum's bias."""
+    sigma_m: float
+    """Standard deviation of a reading from it."""
+    down_b: Sequence[float]
+    """(3,) downward unit vector, body frame."""
 
 
 class BodyPose(NamedTuple):

@@ -143,6 +143,7 @@ def _body(placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: fl
         supply_power_w=np.array([_power(p.vehicle) for p in placements]),
         reach_m=max(_reach_m(p.vehicle, r) for p, r in zip(placements, r_bm, strict=True)),
         passive=_passive(placements, thrusters.matrix),
+        depth_rating_m=min(p.vehicle.depth_rating_m for p in placements),
     )
 
 

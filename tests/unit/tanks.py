@@ -1,5 +1,7 @@
 """Tanks for tests that run whole ticks: a world with the controller's own model, without the bus."""
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation
@@ -19,6 +21,7 @@ from firmware_py.core.types import (
     DockFeedback,
     EscFeedback,
     Inputs,
+    Mode,
     ModuleInputs,
     Outputs,
     Request,
@@ -120,6 +123,24 @@ class Tank:
         row = int(np.flatnonzero((body.tag_module == k) & (body.tag_ids == TOP_FACE))[0])
         q_wt = multiply(x[3:7].copy(), np.ascontiguousarray(body.q_bt[row]))
         return TagObservation(TOP_FACE, 7, tick * PERIOD, x[:3] + world(x).apply(body.r_bt[row]), q_wt)
+
+
+def flies_with_noise(tank: Tank, tamper: Callable[[ModuleInputs], None], mode: Mode) -> None:
+    """Arms the tank's module and flies it for a second in `mode`, with noisy sensors that `tamper` may change in every tick."""
+    rng, hear = np.random.default_rng(0), tank._hear
+
+    def heard(tick: int) -> list[ModuleInputs]:
+        (module,) = hear(tick)
+        assert module.gyro is not None and module.accel is not None and module.pressure_pa is not None
+        module.gyro, module.accel = module.gyro + 0.002 * rng.normal(size=3), module.accel + 0.03 * rng.normal(size=3)
+        module.pressure_pa += 20.0 * rng.normal()
+        tamper(module)
+        return [module]
+
+    tank._hear = heard  # type: ignore[method-assign]
+    tank.run(1.0)
+    tank.run(1.0, Request(Action.ARM))
+    tank.run(1.0, Request(Action.SET_MODE, 0, mode))
 
 
 def world(x: np.ndarray) -> Rotation:

@@ -1,7 +1,6 @@
 """Samples of a frozen IMU and readings that leap are detected and not used; the body flies on without them."""
 
 import math
-from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ from firmware_py.core.types import Action, Mode, ModuleInputs, Request
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from hil.plant.spec import HALF_A_COUNT
-from tests.unit.tanks import PERIOD, Tank, single
+from tests.unit.tanks import PERIOD, Tank, flies_with_noise, single
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 PAIR = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2)
@@ -23,24 +22,6 @@ PAIR = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2)
 
 def sample(value: float, accel: float = 9.8) -> ModuleInputs:
     return ModuleInputs(gyro=np.full(3, value), accel=np.full(3, accel))
-
-
-def flies_with_noise(tank: Tank, tamper: Callable[[ModuleInputs], None], mode: Mode) -> None:
-    """Arms the tank's module and flies it for a second in `mode`, with noisy sensors that `tamper` may change in every tick."""
-    rng, hear = np.random.default_rng(0), tank._hear
-
-    def heard(tick: int) -> list[ModuleInputs]:
-        (module,) = hear(tick)
-        assert module.gyro is not None and module.accel is not None and module.pressure_pa is not None
-        module.gyro, module.accel = module.gyro + 0.002 * rng.normal(size=3), module.accel + 0.03 * rng.normal(size=3)
-        module.pressure_pa += 20.0 * rng.normal()
-        tamper(module)
-        return [module]
-
-    tank._hear = heard  # type: ignore[method-assign]
-    tank.run(1.0)
-    tank.run(1.0, Request(Action.ARM))
-    tank.run(1.0, Request(Action.SET_MODE, 0, mode))
 
 
 def hears(watch: SensorWatch, *modules: ModuleInputs) -> bool:

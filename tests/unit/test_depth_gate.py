@@ -1,0 +1,172 @@
+"""Pressure that cannot be, or that contradicts the tags, is not believed: a false one would take the robot to the surface."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from firmware_py.core.depth_gate import DOUBT, LEAST_GATE_M, PA_PER_M, DepthGate
+from firmware_py.core.measurements import ATMOSPHERE_PA
+from firmware_py.core.types import ExpectedDepth, Mode, ModuleInputs
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble
+from tests.unit.tanks import Tank, flies_with_noise, single
+
+PAIR = assemble([(0, 0, 0), (0, 0, 1)], [0, 0], [load_vehicle("modcube")] * 2)
+"""Two modules, one above the other."""
+LEVEL = (0.0, 0.0, 1.0)
+AT_3_M = ExpectedDepth(3.0, 0.003, LEVEL)
+
+
+def pressure_at(depth_m: float) -> float:
+    return ATMOSPHERE_PA + PA_PER_M * depth_m
+
+
+def told(gate: DepthGate, depths_m: Sequence[float], expected: ExpectedDepth | None = AT_3_M, armed: bool = True) -> list[float | None]:
+    """The depths that are left of readings of a single module."""
+    left = []
+    for depth_m in depths_m:
+        (module,) = gate.step([ModuleInputs(pressure_pa=pressure_at(depth_m))], expected, armed)
+        assert gate.heard == (module.pressure_pa is not None)
+        left.append(None if module.pressure_pa is None else round((module.pressure_pa - ATMOSPHERE_PA) / PA_PER_M, 4))
+    return left
+
+
+def trusted() -> DepthGate:
+    gate = DepthGate(single())
+    assert told(gate, [3.01] * 5) == [3.01] * 5
+    return gate
+
+
+@pytest.mark.parametrize("pressure_pa", [0.0, 41e3, 1.0e6, 1.3e6])
+def test_pressure_far_below_the_atmosphere_or_far_deeper_than_the_hull_stands_is_not_believed_even_without_tags(pressure_pa: float) -> None:
+    """The module is made for 50 m."""
+    gate = DepthGate(single())
+    (module,) = gate.step([ModuleInputs(pressure_pa=pressure_pa, heard=True)], None, armed=False)
+    assert module.pressure_pa is None and module.heard and not gate.heard
+
+
+@pytest.mark.parametrize("pressure_pa", [63e3, 101e3, 600e3])
+def test_pressure_in_a_lake_high_above_the_sea_and_at_the_greatest_permitted_depth_is_believed(pressure_pa: float) -> None:
+    gate = DepthGate(single())
+    assert gate.step([ModuleInputs(pressure_pa=pressure_pa)], None, armed=False)[0].pressure_pa == pressure_pa
+
+
+def test_offset_of_some_decimetres_is_learnt_in_half_a_second_and_never_reaches_the_estimate() -> None:
+    gate = trusted()
+    assert told(gate, [3.3] * (DOUBT + 2)) == [None] * DOUBT + [3.0] * 2
+    assert told(gate, [3.31, 3.30 + 1.1 * LEAST_GATE_M], AT_3_M) == [3.01, None]
+    assert told(gate, [4.3], None) == [4.0], "without tags it is still known"
+
+
+def test_offset_of_a_few_centimetres_is_left_to_the_filter() -> None:
+    assert told(trusted(), [3.03] * (2 * DOUBT)) == [3.03] * (2 * DOUBT)
+
+
+def test_gate_is_as_wide_as_the_filter_is_unsure() -> None:
+    unsure = AT_3_M._replace(sigma_m=0.1)
+    assert told(trusted(), [3.49, 3.51], unsure) == [3.49, None]
+
+
+def test_sensor_that_errs_by_metres_is_not_believed_with_tags_nor_without_until_it_agrees_with_them_again() -> None:
+    gate = trusted()
+    assert told(gate, [8.0] * (3 * DOUBT)) == [None] * (3 * DOUBT)
+    assert told(gate, [8.0, 3.0, 3.0], None) == [None] * 3, "no tag bears it out"
+    assert told(gate, [3.0] * (DOUBT + 1)) == [None] * (DOUBT - 1) + [3.0] * 2
+    assert told(gate, [2.0], None) == [2.0]
+
+
+def test_few_false_readings_do_not_make_a_sensor_distrusted() -> None:
+    assert told(trusted(), [8.0, 3.0] * 50) == [None, 3.0] * 50
+    gate = trusted()
+    told(gate, [8.0] * (DOUBT - 1))
+    assert told(gate, [3.0], None) == [3.0]
+
+
+def test_sensor_with_noise_of_decimetres_is_distrusted() -> None:
+    gate = trusted()
+    told(gate, 3.0 + 0.15 * np.random.default_rng(0).standard_normal(200))
+    assert told(gate, [3.0], None) == [None]
+
+
+def test_robot_at_rest_learns_whatever_datum_the_tags_have_and_a_flying_one_that_never_knew_it_too() -> None:
+    steady = [1.5] * (DOUBT + 1)
+    assert told(DepthGate(single()), steady)[-1] == 3.0
+    gate = trusted()
+    assert told(gate, steady)[-1] is None
+    assert told(gate, steady, armed=False)[-1] == 3.0
+
+
+def test_each_module_is_judged_by_itself_where_it_is() -> None:
+    """The second module hangs 0.21 m below the first; the one of them that errs stays known to a body that takes over."""
+    gate, above, below = DepthGate(PAIR), pressure_at(3.0 - 0.105), pressure_at(3.0 + 0.105)
+    for _ in range(2):
+        left = gate.step([ModuleInputs(pressure_pa=above), ModuleInputs(pressure_pa=below)], AT_3_M, armed=True)
+        assert [module.pressure_pa for module in left] == [above, below]
+    for _ in range(DOUBT):
+        left = gate.step([ModuleInputs(pressure_pa=above), ModuleInputs(pressure_pa=below + 5e4)], AT_3_M, armed=True)
+        assert [module.pressure_pa for module in left] == [above, None] and gate.heard
+    part = DepthGate(single(1))
+    part.take_over([gate])
+    part.step([ModuleInputs(), ModuleInputs(pressure_pa=below)], None, armed=True)
+    assert not part.heard
+
+
+# ---------------------------------------------------------------- the robot
+
+
+def with_pressure(change: Callable[[float, int], float], mode: Mode, seconds: float = 6.0) -> tuple[Tank, float]:
+    """Flies in `mode` with a false pressure; returns the tank, and the farthest that it went up or down, m."""
+    tank, since, farthest = Tank([single()]), -1, 0.0
+
+    def tamper(module: ModuleInputs) -> None:
+        if since >= 0 and module.pressure_pa is not None:
+            module.pressure_pa = change(module.pressure_pa, len(tank.outputs) - since)
+
+    flies_with_noise(tank, tamper, mode)
+    tank.run(1.0)
+    since, z = len(tank.outputs), tank.states[0][2]
+    for _ in range(round(seconds / 0.01)):
+        tank.run(0.01)
+        farthest = max(farthest, abs(tank.states[0][2] - z))
+    return tank, farthest
+
+
+WRONG: dict[str, Callable[[float, int], float]] = {
+    "reads nothing": lambda _, tick: float(tick % 7),
+    "reads its limit": lambda _, tick: 1.04e6 + tick % 7,
+    "5 m too deep": lambda pa, _: pa + 5e4,
+    "2 m too high": lambda pa, _: pa - 2e4,
+    "a gain of 1.5": lambda pa, _: 1.5 * pa,
+}
+
+
+@pytest.mark.parametrize("mode", [Mode.POSHOLD, Mode.ALT_HOLD])
+@pytest.mark.parametrize("wrong", WRONG)
+def test_robot_that_sees_tags_keeps_mode_and_depth_when_its_pressure_sensor_fails_and_says_so(wrong: str, mode: Mode) -> None:
+    """It let go of its place or depth, and swam up by as much as 2.9 m."""
+    tank, farthest = with_pressure(WRONG[wrong], mode)
+    assert farthest < 0.03
+    assert tank.outputs[-1].records[0].mode == mode
+    assert any(event.text == "fail-safe on: no pressure for 1.0 s" for outputs in tank.outputs for event in outputs.events)
+
+
+@pytest.mark.parametrize("offset_pa", [700.0, 3000.0, -3000.0])
+def test_robot_keeps_its_depth_when_the_weather_changes_at_once(offset_pa: float) -> None:
+    """Three decimetres moved it by 0.2 m."""
+    tank, farthest = with_pressure(lambda pa, _: pa + offset_pa, Mode.ALT_HOLD, 2.0)
+    assert farthest < 0.01
+    assert not any("fail-safe" in event.text for outputs in tank.outputs for event in outputs.events)
+
+
+def test_robot_that_loses_the_tags_with_a_false_pressure_comes_up_as_one_that_knows_no_depth() -> None:
+    tank, _ = with_pressure(WRONG["5 m too deep"], Mode.ALT_HOLD, 2.0)
+    hear = tank._hear
+
+    def blind(tick: int) -> list[ModuleInputs]:
+        (module,) = hear(tick)
+        module.tags = []
+        return [module]
+
+    tank._hear = blind  # type: ignore[method-assign]
+    assert tank.run(7.0).records[0].mode == Mode.SURFACE
