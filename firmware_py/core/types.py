@@ -13,8 +13,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from firmware_py.description.vehicle import MOST_THRUSTERS
+
 Array = np.ndarray
-CHANNELS, FACES = 8, 6
+CHANNELS, FACES = MOST_THRUSTERS, 6
 """Number of thruster commands in one module's frames; number of docking faces of a module, each with its relay."""
 RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
 """States of a docking relay, as DOCK_CMD has them."""

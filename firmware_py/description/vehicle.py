@@ -35,6 +35,9 @@ FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 """Degrees of freedom, in the order of a wrench and of every array of six here."""
 
+MOST_THRUSTERS = 8
+"""Thrusters of one module for which its CAN frames have commands."""
+
 FACE_NORMALS = frozen_array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1], [0, 0, -1]])
 """(6, 3) outward normals of the faces, module frame."""
 
@@ -268,6 +271,11 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
     return vehicle
 
 
+def too_many_thrusters() -> str:
+    """What is wrong with a vehicle of more than MOST_THRUSTERS thrusters, and the remedy."""
+    return f"a module's frames carry {MOST_THRUSTERS}: leave some out, or divide the vehicle into docked modules"
+
+
 def _check_body(vehicle: Vehicle, source: Source) -> None:
     """Raises DescriptionError, which names the line, if the body is impossible, or its name cannot be a file name."""
     passive, com, half = vehicle.passive_dof, vehicle.inertial.com_m, 0.5 * vehicle.hull.size_m
@@ -277,6 +285,9 @@ def _check_body(vehicle: Vehicle, source: Source) -> None:
         raise source.error(("passive_dof",), f"{passive[i]} is there twice; name each degree of freedom once")
     if len(passive) == len(limits_of(Vehicle, "passive_dof").choices):
         raise source.error(("passive_dof",), "all six are left to buoyancy; a vehicle steers one at least")
+    if len(vehicle.thruster) > MOST_THRUSTERS:
+        what = f"{len(vehicle.thruster)} thrusters; {too_many_thrusters()}"
+        raise source.error(("thruster", MOST_THRUSTERS), what)
     if not vehicle.hull.mesh and np.any(np.abs(com) > half):
         what = f"{com.tolist()} m is outside the hull, a box of {' x '.join(f'{edge:g}' for edge in vehicle.hull.size_m)} m about [0, 0, 0]"
         raise source.error(("inertial", "com_m"), what)

@@ -14,10 +14,9 @@ import numpy as np
 from firmware_py.core import rotations
 from firmware_py.core.body import ARM_SIGMA_M, BUOYANCY_SIGMA_N, TRIM_SIGMA_M, Body, ThrusterSet, can_make
 from firmware_py.core.observation import GRAVITY
-from firmware_py.core.types import CHANNELS
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import AXES, Vehicle
+from firmware_py.description.vehicle import AXES, MOST_THRUSTERS, Vehicle, too_many_thrusters
 from firmware_py.prepare import drag_table
 from firmware_py.prepare.drag_cache import DragCache
 from firmware_py.prepare.joints import Placement, check_joints
@@ -78,8 +77,8 @@ def check_fleet(fleet: Fleet, vehicles: Mapping[str, Vehicle]) -> None:
     Raises DescriptionError, which names module numbers.
     """
     for name, vehicle in vehicles.items():
-        if len(vehicle.thruster) > CHANNELS:
-            raise DescriptionError(f"vehicle {name}: {len(vehicle.thruster)} thrusters; a module's frames carry {CHANNELS}")
+        if len(vehicle.thruster) > MOST_THRUSTERS:
+            raise DescriptionError(f"vehicle {name}: {len(vehicle.thruster)} thrusters; {too_many_thrusters()}")
     for members in groups_of(fleet):
         check_joints(place(*described(fleet, members, vehicles)), [fleet.label(i) for i in members], fleet.pitch_m)
 

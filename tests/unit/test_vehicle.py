@@ -10,6 +10,7 @@ import pytest
 from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
+from firmware_py import cli
 from firmware_py.description.schema import DescriptionError, limits_of
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import (
@@ -249,6 +250,14 @@ def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
 def test_odd_vehicle_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
     with pytest.raises(DescriptionError, match=words):
         load_vehicle(str(changed(tmp_path, old, new)))
+
+
+def test_vehicle_with_more_thrusters_than_its_frames_carry_is_refused_at_the_first_that_is_too_many(tmp_path: Path) -> None:
+    path = changed(tmp_path, "[[tag]]", "[[thruster]]\nposition_m = [0.0, 0.0, 0.0]\ndirection = [1.0, 0.0, 0.0]\n\n[[tag]]")
+    line = path.read_text()[: path.read_text().rindex("[[thruster]]")].count("\n") + 1
+    words = rf"odd.toml:{line}: thruster\[8\]: 9 thrusters; a module's frames carry 8: leave some out, or divide the vehicle"
+    with pytest.raises(DescriptionError, match=words):
+        cli.vehicle(str(path))
 
 
 @pytest.mark.parametrize(
