@@ -6,14 +6,14 @@ BIN := .venv/bin
 PY := $(BIN)/python
 STAMP := .venv/.stamp
 CLIENTS_STAMP := .venv-clients/.stamp
-# The distribution's Python first: it is built with profile-guided optimisation and runs a tick a fifth faster than a plain build.
+# The Python of the distribution first: it is built with profile-guided optimisation and runs a tick a fifth faster than a plain build.
 PYTHONS := /usr/bin/python3.12 /usr/bin/python3.11 python3.12 python3.11 python3
 SYSTEM_PACKAGES := qemu-system-x86 busybox-static cpio kmod can-utils iproute2 gcc
 FLASH_PACKAGES := debootstrap e2fsprogs openssh-client
 PYTHON_PACKAGES := python3-venv
-# What `make bench` measures beside; nothing else needs it.
+# Peer that `make bench` compares with; nothing else needs it.
 PEERS := mujoco==4.0.0
-# Of tools/ and tests/: names, attributes and the arguments of calls. Arrays and lambdas there are as loose as what they are handed to.
+# For tools/ and tests/, mypy checks names, attributes and the arguments of calls. Arrays and lambdas there are checked as loosely as the code that they are passed to.
 MYPY_LOOSE := --allow-untyped-defs --allow-incomplete-defs --allow-untyped-calls --allow-any-generics --no-warn-return-any \
 	--no-warn-unused-ignores --implicit-reexport $(addprefix --disable-error-code=,arg-type list-item misc union-attr)
 PIP_INSTALL := -m pip install --quiet --quiet --disable-pip-version-check --no-deps
@@ -73,7 +73,7 @@ test: setup ## lint and all tests that this machine can run; names what is left 
 test-vcan: setup ## the tests on real SocketCAN: here, or in the virtual machine where there is none
 	@$(PY) -m pytest -rs --capture=no -m vcan tests/vcan
 
-test-flash: setup ## flash a Debian machine with systemd, break it, pull its plug: half an hour
+test-flash: setup ## flash a Debian machine with systemd, break it, cut its power: half an hour
 	@$(PY) -m pytest -rs -x -m jetson tests/jetson
 
 hil: setup ## fly the spiral on the bench and name the report
@@ -93,7 +93,7 @@ bench: setup ## measure the code; writes bench.json and the tables of README and
 UV_COMPILE = uv pip compile --quiet --python-version 3.11 --generate-hashes --no-emit-index-url \
 	--fork-strategy fewest --custom-compile-command 'make lock' $(UPGRADE)
 
-lock: setup ## write both locks anew from pyproject.toml (needs uv)
+lock: setup ## write both locks again from pyproject.toml (needs uv)
 	@$(UV_COMPILE) --universal --extra bench --extra tools --extra dev pyproject.toml --output-file requirements.lock
 	@$(PY) -c 'import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
 	print(*project["optional-dependencies"]["clients"], sep="\n")' | \

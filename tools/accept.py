@@ -178,8 +178,8 @@ GROUPS: tuple[Group, ...] = (
         "speed", 2, "make bench", timed,
         (
             Figure("spiral in lockstep with recorder and real frames, one core", "speed", low=25.0, unit="x real time"),
-            Figure("that core meanwhile: ten million additions in plain Python", "additions", unit="s"),
-            Figure("that core meanwhile: a load out of 8 MB that waits for the one before", "load", unit="ns"),
+            Figure("the same core at that time: ten million additions in plain Python", "additions", unit="s"),
+            Figure("the same core at that time: one of a chain of dependent loads from 8 MB", "load", unit="ns"),
         ),
     ),
     Group(
@@ -223,7 +223,7 @@ GROUPS: tuple[Group, ...] = (
     ),
     Group(
         "dock-near-miss", 5, "modcube hil campaign dock-near-miss --trials 300 --jobs 2", campaign_of("dock-near-miss", trials=300),
-        (Figure("near miss, 300 flown: docks declared that were none", "false_declarations.max", high=0.0),),
+        (Figure("near miss, 300 flown: docks declared falsely", "false_declarations.max", high=0.0),),
     ),
     Group(
         "near-miss-passes", 5, "make accept ONLY=near-miss-passes", near_miss_passes,
@@ -265,7 +265,10 @@ GROUPS: tuple[Group, ...] = (
     Group(
         "identify", 9, "python tools/identify_plants.py --plants 10 --jobs 2", identified_plants,
         (
-            Figure("10 plants told from 3-minute logs, load cell +-2 %: total mass, worst error", "mass", high=10.0, unit="%", scale=100.0),
+            Figure(
+                "10 plants identified from 3-minute logs, load cell +-2 %: total mass, worst error",
+                "mass", high=10.0, unit="%", scale=100.0,
+            ),
             Figure("the same: drag coefficients, worst error", "drag", high=10.0, unit="%", scale=100.0),
             Figure("the same: relative thruster gains, worst error", "gain", high=10.0, unit="%", scale=100.0),
             Figure("the same: 95 % intervals that hold the truth", "covered", low=85.0, unit="%", scale=100.0),

@@ -152,7 +152,7 @@ def replayed(folder: Path) -> Values:
 SAFETY: tuple[Group, ...] = (
     Group(
         "faults", 7, "modcube hil campaign faults", fault_matrix,
-        (Figure("faults by modes: status of the campaign, 0 where all is as the table promises", "failed", high=0.0),),
+        (Figure("faults by modes: status of the campaign, 0 if every outcome is as the table specifies", "failed", high=0.0),),
     ),
     Group(
         "thrusters", 7, "make accept ONLY=thrusters", thrusters_out,
@@ -175,14 +175,14 @@ SAFETY: tuple[Group, ...] = (
         "frame-loss", 7, "make accept ONLY=frame-loss", frames_lost,
         (
             Figure("spiral through 30 % lost frames, 5 seeds: position RMSE, worst", "rmse", high=8.0, unit="mm", scale=1e3),
-            Figure("all frames lost: a command outlives the last frame by", "outlives", high=110.0, unit="ms"),
+            Figure("all frames lost: a command acts after the last frame for", "outlives", high=110.0, unit="ms"),
         ),
     ),
     Group(
         "estop", 7, "make accept ONLY=estop", stopped,
         (
-            Figure("1000 e-stops: ticks after it with a command, or without the frames that say none", "violations", high=0.0),
-            Figure("the same: flights that were armed when it came", "armed", low=500.0),
+            Figure("1000 e-stops: ticks afterwards with a command, or without the frames that command zero", "violations", high=0.0),
+            Figure("the same: flights that were armed at the e-stop", "armed", low=500.0),
         ),
     ),
     Group(
@@ -202,7 +202,7 @@ SAFETY: tuple[Group, ...] = (
             Figure("the same: RMSE over the five seconds, median", "rmse_median", unit="mm", scale=1e3),
             Figure("the same: RMSE, 95 %", "rmse_p95", unit="mm", scale=1e3),
             Figure("the same: error of the estimate, worst, in its own sigmas", "sigmas", high=MOST_SIGMAS),
-            Figure("the same: mean square of them (1: consistent)", "square", low=MEAN_SQUARE_LIMITS[0], high=MEAN_SQUARE_LIMITS[1]),
+            Figure("the same: mean square, in sigmas (1: consistent)", "square", low=MEAN_SQUARE_LIMITS[0], high=MEAN_SQUARE_LIMITS[1]),
         ),
     ),
     Group(
@@ -212,7 +212,7 @@ SAFETY: tuple[Group, ...] = (
             Figure("the same: 95 %", "p95", unit="mm", scale=1e3),
             *LEAST,
             Figure("the same: error of the estimate, worst, in its own sigmas", "sigmas", high=MOST_SIGMAS),
-            Figure("the same: mean square of them (1: consistent)", "square", low=MEAN_SQUARE_LIMITS[0], high=MEAN_SQUARE_LIMITS[1]),
+            Figure("the same: mean square, in sigmas (1: consistent)", "square", low=MEAN_SQUARE_LIMITS[0], high=MEAN_SQUARE_LIMITS[1]),
         ),
     ),
     Group(
@@ -228,7 +228,7 @@ SAFETY: tuple[Group, ...] = (
         "fuzz", 7, "make accept ONLY=fuzz", fuzzed,
         (
             Figure("a million fuzzed frames: commands beyond their limits", "beyond", high=0.0),
-            Figure("the same: frames that no count accounts for", "unaccounted", high=0.0),
+            Figure("the same: frames that no counter has counted", "unaccounted", high=0.0),
         ),
     ),
     Group(

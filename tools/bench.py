@@ -63,8 +63,8 @@ def flight_entries() -> list[Entry]:
             "required", REQUIRED_SPEED, speed / REQUIRED_SPEED,
         )
     ]  # fmt: skip
-    entries.append(Entry("that core meanwhile: ten million additions in plain Python", median(additions), "s"))
-    entries.append(Entry("that core meanwhile: a load out of 8 MB that waits for the one before", median(loads), "ns"))
+    entries.append(Entry("the same core at that time: ten million additions in plain Python", median(additions), "s"))
+    entries.append(Entry("the same core at that time: one of a chain of dependent loads from 8 MB", median(loads), "ns"))
     for name, ticks_us in (("pipeline.step", flights[0].pipeline_us), ("firmware's whole tick", flights[0].tick_us)):
         for label, q in (("p50", 50.0), ("p99", 99.0), ("p99.9", 99.9)):
             value = float(np.percentile(ticks_us, q))

@@ -22,13 +22,14 @@ from firmware_py.description.parameters import Parameters
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "supervisor.md"
 NEEDS = """\
 Attitude comes from tags, or from gravity until the first tag: one second after a start without tags roll and pitch are known, and ten tags
-that agree give position and heading. Position comes from tags only. SURFACE without an attitude lifts along the body. A pilot is missing
-who was heard and then fell silent; where none was ever heard, the sticks are neutral, and the first that arrive count."""
+that agree give position and heading. Position comes from tags only. SURFACE without an attitude pushes up along the body's own axis.
+The pilot counts as lost once stick input was received and then stopped; if none was ever received, the sticks are neutral, and the first
+input that arrives counts."""
 WHILE_TESTED = """\
 In MOTOR_DETECT a body is disarmed instead, whatever the action, if a motor test armed it or it never saw a tag: it may lie on a bench. A
 cause that returns before its fail-safe has ended acts again after its delay. A disarmed or stopped body keeps the mode that a person chose;
-after a motor test, a dock or a fail-safe's mode it goes to POSHOLD. A mode that a person chose and fail-safes left as it was is that
-person's again when they are over."""
+after a motor test, a dock or a fail-safe's mode it goes to POSHOLD. If a person chose a mode and the fail-safes did not
+change it, it counts as that person's choice again when they are over."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -74,7 +75,7 @@ def modes() -> list[str]:
         (row.mode.name, str(int(row.mode)), ", ".join(words(n.name) for n in sorted(row.needs)), "yes" if row.by_pilot else "")
         for row in MODE_TABLE
     ]
-    return [*table(("mode", "number", "needs", "a pilot may always take it"), rows), NEEDS, ""]
+    return [*table(("mode", "number", "needs", "a pilot may always select it"), rows), NEEDS, ""]
 
 
 def arming() -> list[str]:
@@ -103,7 +104,7 @@ def failsafes() -> list[str]:
         ends = "disarming" if watch.latched else f"cause gone for {parameters.clear_s:g} s"
         says = row.words.format(float("nan")).replace("nan", "N")
         rows.append((f"`{row.name}`", says, limit, delay, words(watch.level.name), ends, counts_in(row)))
-    return table(("fail-safe", "says", "limit", "delay", "action", "ends by", "counts in"), rows)
+    return table(("fail-safe", "text", "limit", "delay", "action", "ends by", "active in"), rows)
 
 
 def permitted() -> list[str]:
@@ -112,7 +113,7 @@ def permitted() -> list[str]:
     for level in Level:
         allowed = PERMITTED[level]
         names = "all" if allowed == ANY else ", ".join(sorted(m.name for m in allowed)) or "none"
-        steps = " or else ".join(words(t.name.removeprefix("FAILSAFE_")) for t in LADDER.get(level, ()))
+        steps = ", else ".join(words(t.name.removeprefix("FAILSAFE_")) for t in LADDER.get(level, ()))
         rows.append((str(int(level)), words(level.name), steps, names))
     return table(("number", "action", "does", "modes that may be entered meanwhile"), rows)
 
@@ -121,10 +122,11 @@ def page() -> str:
     """The whole page."""
     lines = [
         "# Supervisor", "",
-        "Drawn from the tables in `firmware_py/core` by `.venv/bin/python tools/draw_supervisor.py`; do not edit.", "",
+        "Generated from the tables in `firmware_py/core` by `.venv/bin/python tools/draw_supervisor.py`; do not edit.", "",
         "## States", "", *diagram(), "All transitions; a request without a row is refused with a text.", "", *transitions(),
         "## Modes", "", *modes(), "## Arming checks", "", *arming(),
-        "## Fail-safes", "", "Gravest first, with the default parameters (`failsafes.NAME_limit`, `_delay_s`, `_action`, `_latched`).", "",
+        "## Fail-safes", "",
+        "Most severe first, with the default parameters (`failsafes.NAME_limit`, `_delay_s`, `_action`, `_latched`).", "",
         *failsafes(), "### Actions", "", *permitted(), WHILE_TESTED,
     ]  # fmt: skip
     return "\n".join(lines).rstrip() + "\n"

@@ -127,7 +127,7 @@ def bench_table(entries: Entries, words: Sequence[str], old: str) -> str:
         )
         for e in chosen("bench", entries, words, lambda e: any(word in e["name"] for word in words))
     ]  # fmt: skip
-    return rows(("what", "measured", "beside", "its figure", "times better"), body)
+    return rows(("what", "measured", "compared with", "its figure", "times better"), body)
 
 
 TABLES = {"accept": accept_table, "bench": bench_table}
