@@ -25,6 +25,8 @@ ARMED_WITHIN_S = 0.1
 """Allowance for the answer, which comes one or two ticks, of at most 20 ms, later."""
 YAWS = 37
 """Number of headings checked over the range that a seed may draw: at most 10 deg apart."""
+SEVERAL_BODIES = ("dock", "force")
+"""Kinds of tasks that steer and judge every body; the others steer that of the first module alone."""
 Mistake = tuple[tuple[str | int, ...], str]
 """Path of keys to the wrong entry, and the error message."""
 
@@ -105,6 +107,10 @@ def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:
     kind, counts = scenario.task.kind, [len(members) for members in scenario.groups]
     if kind == "dock" and len(module_numbers(scenario)) < 2:
         yield ("task", "kind"), "dock needs two modules at least, and there is one"
+    if kind not in SEVERAL_BODIES and len(counts) > 1:
+        leaders = ", ".join(str(scenario.module[members[0]].number) for members in scenario.groups)
+        what = f"{kind} steers and judges one body, and there are {len(counts)}, led by modules {leaders}"
+        yield ("task", "kind"), f"{what}; give the modules one `body` number, or fly {' or '.join(SEVERAL_BODIES)}"
     if kind == "force" and not {1, 2} <= set(counts):
         found = ", ".join(map(str, counts))
         yield ("task", "kind"), f"force compares a module alone with two docked ones; the bodies here have {found} modules"

@@ -148,7 +148,7 @@ def test_what_only_lockstep_can_break_is_refused_in_real_time(
         assert line.count("\n") == 1
 
 
-NEAR = '[[module]]\nnumber = 2\nposition_m = [0.0, 0.1, 0.38]\n'
+NEAR = '[[module]]\nnumber = 2\nposition_m = [0.0, 0.1, 0.38]\n[[step]]\ndo = "wait"\n[task]\nkind = "dock"'
 NORTH = "x_m,y_m,z_m,duration_s\n0,0,0.38,\n0.1,north,0.38,5\n"
 
 
@@ -163,7 +163,7 @@ REALTIME = pytest.param(["--realtime", "--bus", "udp:239.74.163.9:43127"], marks
         ("", "", ["--vehicle", "no_mesh.toml"], "none.stl: there is no such mesh"),
         ("", "", ["--rate", "120"], "--rate 120"),
         ("", "", ["--bus", "socketcan:can9"], "there is no such interface"),
-        ("[task]", f"{NEAR}\n[task]", [], "modules 1 and 2 start 0.1 m apart, one inside the other"),
+        ('[task]\nkind = "hover"', NEAR, [], "modules 1 and 2 start 0.1 m apart, one inside the other"),
         ('kind = "hover"', 'kind = "waypoints"\nfile = "points.csv"', [], "points.csv:3: y_m: 'north' is not a number"),
     ],
     ids=["vehicle", "mesh", "rate", "bus", "overlap", "waypoints"],

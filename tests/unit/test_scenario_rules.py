@@ -30,6 +30,7 @@ Load = Callable[..., Scenario]
 WHOLE_BUS = ("estop", "foreign_sync", "foreign_command", "process_killed")
 """Kinds of faults that concern no single module."""
 DOCK_STEP = '[[step]]\ndo = "dock"\nmodule = 2\nface = "-x"\ntarget_module = 1\ntarget_face = "+x"\n'
+ASIDE = '[[module]]\nnumber = 2\nposition_m = [0.45, 0.45, 0.38]\n'
 SECOND = '[[module]]              # the active one, on the right\nnumber = 2\nvehicle = "modcube"\nposition_m = [0.40, 0.0, 0.38]\n'
 
 
@@ -60,6 +61,8 @@ def load(tmp_path: Path) -> Load:
         ("force-tracking", "body = 0\ncell = [1, 0, 0]", "body = 0\ncell = [1, 0, 0]\n[[module]]\nnumber = 4\nposition_m = [2, 0, 1]",
          "module[0]: the body of module 1 has as many modules as another"),
         ("force-tracking", "clamped = true\nbody = 0", "body = 0", "module[1]: no load cell holds the body of module 2, whose"),
+        *((name, "[task]", f"{ASIDE}\n[task]", f"task.kind: {kind} steers and judges one body, and there are 2, led by modules 1, 2; give")
+          for name, kind in (("hover", "hover"), ("spiral", "spiral"), ("faults", "mode"))),
         ("hover", 'kind = "hover"', 'kind = "force"', "force compares a module alone with two docked ones"),
         ("polycube", "number = 1", "number = 25", "module[0].number: 25 and 7 more go up to 32; the bus has numbers to 29, so it is 22"),
         ("polycube", "[polycube]", "[[module]]\nnumber = 9\n[polycube]", "module[1]: a [polycube] takes the place of all modules"),
