@@ -18,6 +18,7 @@ from firmware_py.bus.codec import Codec, Frame
 from firmware_py.prepare.paths import Harmonic, Hold
 from firmware_py.prepare.piecewise import Piecewise
 from firmware_py.runtime.flight_log import FlightLog, LogError, LoggedTick
+from firmware_py.runtime.log_damage import ticks_held
 from firmware_py.runtime.recorder import candump_lines
 from firmware_py.runtime.request_text import CORE_TYPES, read_request
 from firmware_py.runtime.tick_messages import TickMessages
@@ -37,6 +38,10 @@ class Outcome:
     first: Difference | None = None
     torn: str = ""
     """Where the log ends too early or is damaged; empty when it is whole."""
+    is_damaged: bool = False
+    """Whether the log goes on behind that place."""
+    held: int = 0
+    """Number of ticks of which a torn or damaged log holds anything; as `ticks` for a whole one."""
 
 
 class DueWorker(InlineWorker):
@@ -82,7 +87,8 @@ class Replay:
             outcome.ticks, outcome.seconds = outcome.ticks + 1, (logged.time_ns - start_ns) * 1e-9
             if outcome.first is not None:
                 break
-        outcome.torn = self._log.torn
+        outcome.torn, outcome.is_damaged = self._log.torn, self._log.is_damaged
+        outcome.held = max(outcome.ticks, ticks_held(self._log.folder)) if outcome.torn else outcome.ticks
         return outcome
 
     def step(self, logged: LoggedTick) -> Difference | None:

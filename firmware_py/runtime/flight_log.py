@@ -13,6 +13,7 @@ from google.protobuf.message import DecodeError
 
 from firmware_py.description.schema import SHOWN_CHARACTERS, DescriptionError
 from firmware_py.description.signals import MCAP_MAGIC, Layout, LogMessage, TextLayout, is_closed, read_attachment, read_messages
+from firmware_py.runtime.log_damage import damaged_at, is_stamp
 from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG, candump_stamp
 from firmware_py.runtime.tick_messages import REQUESTS, TICK_SIGNALS, TICKS, is_of_the_machine
 
@@ -73,6 +74,7 @@ class FlightLog:
     Attributes:
         configuration: from which the firmware was built; None where the log holds none.
         torn: describes where the log ends too early or is damaged; empty for a whole log. Complete once `ticks` is exhausted.
+        is_damaged: whether more data follows the place at which reading stopped, which a log that only ends too early lacks; likewise.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -87,6 +89,7 @@ class FlightLog:
         text = read_attachment(folder / SIGNAL_LOG, CONFIGURATION)
         self.configuration: dict[str, Any] | None = self._configuration(text) if text is not None else None
         self.torn = "" if is_closed(folder / SIGNAL_LOG) else f"{SIGNAL_LOG} was not closed"
+        self.is_damaged = False
 
     def _configuration(self, text: bytes) -> dict[str, Any]:
         try:
@@ -117,6 +120,7 @@ class FlightLog:
                     raise
                 not_closed = f"{self.torn}; " if self.torn else ""
                 self.torn = f"{not_closed}{self._damaged_from(held, first, damage)}"
+                self.is_damaged = any(is_stamp(behind.stamp) for behind in groups)
                 return
             if held is not None:
                 yield held
@@ -128,7 +132,15 @@ class FlightLog:
         if held is not None and (goes_on or not self.torn):
             yield held
         if goes_on:
+            self._tear_signals()
+
+    def _tear_signals(self) -> None:
+        """Describes a signal log that ends, or is damaged, before can.log ends."""
+        if (at := damaged_at(self.folder / SIGNAL_LOG)) is None:
             self._tear(f"{SIGNAL_LOG} ends before {CAN_LOG}")
+            return
+        self.is_damaged = True
+        self.torn = f"{f'{self.torn}; ' if self.torn else ''}{SIGNAL_LOG} is damaged at byte {at}"
 
     def _tear(self, where: str) -> None:
         self.torn = self.torn or where
