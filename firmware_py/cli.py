@@ -190,7 +190,7 @@ def replay(
         float, typer.Option(min=0.0, max=1.0, help="largest relative difference of numbers, for logs of another machine; 0: exact bytes")
     ] = 0.0,
 ) -> None:
-    """Feed a recorded flight to the same code again and compare every byte that comes out; status 1 when one differs or the log is damaged."""
+    """Feed a recorded flight to the same code again and compare every byte; status 1 when one differs or the log is damaged."""
     from firmware_py.app.replay_report import replay_and_say
 
     raise typer.Exit(replay_and_say(log, tolerance, say=lambda line: typer.echo(line)))

@@ -29,7 +29,7 @@ from hil.metrics import PAPER_SPIRAL_RMSE_MM, Poses, flight_metrics, warning_lin
 from hil.plant.spec import Tank
 from hil.plots import PLOTS, Window, write_plots
 from hil.realtime import fly_in_real_time
-from hil.replaceable import check_replaceable, created_folder, is_json_with
+from hil.replaceable import check_alone, check_replaceable, created_folder, is_json_with
 from hil.report import REPORT_FILE, Scene, write_report
 from hil.scenario import Scenario
 from hil.script import Script
@@ -77,9 +77,10 @@ def fly_and_judge(
 
 
 def check_folder(folder: Path) -> None:
-    """Raises DescriptionError if a flight into `folder` would overwrite files that no flight left there."""
+    """Raises DescriptionError if a flight into `folder` would overwrite files that no flight left there, or lie among other files."""
     is_flight = is_truth_log(folder / TRUTH_LOG) or is_json_with(folder / RESULT_FILE, "checks")
     check_replaceable(folder, (*LOGS, *LEFT_BEHIND), is_flight, "flight of the bench")
+    check_alone(folder, (*LOGS, *LEFT_BEHIND), is_flight, "flight of the bench")
 
 
 def _clear(folder: Path) -> None:

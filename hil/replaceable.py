@@ -24,6 +24,14 @@ def check_replaceable(folder: Path, names: Iterable[str], is_earlier_run: bool, 
         raise DescriptionError(f"{folder} holds {', '.join(held)}, which no {run} left there; move what is yours or give another --out")
 
 
+def check_alone(folder: Path, names: Iterable[str], is_earlier_run: bool, run: str) -> None:
+    """Raises DescriptionError if `folder` holds anything but files of these names, hidden ones aside, and is not an earlier run's."""
+    others = sorted(path.name for path in folder.iterdir() if path.name not in set(names) and not path.name.startswith("."))
+    if others and not is_earlier_run:
+        what = f"{others[0]}{f' and {len(others) - 1} more' if len(others) > 1 else ''}"
+        raise DescriptionError(f"{folder} holds {what}, and no {run}; give an --out that is empty, new, or an earlier flight's")
+
+
 @contextmanager
 def created_folder(folder: Path) -> Iterator[None]:
     """Makes `folder` and its parents; at the end removes those of them that it made and that are empty. Raises OSError."""

@@ -141,7 +141,7 @@ def test_what_only_lockstep_can_break_is_refused_in_real_time(
     path.write_text(f'{text}\n[[fault]]\nkind = "leak"\n[[fault]]\nkind = "process_killed"\nat_s = 5.0\n', encoding="utf-8")
     bus = ["--bus", "udp:239.74.163.9:43119"]
     monkeypatch.setattr(hil.plant_process.PlantProcess, "serve", lambda *_: None)
-    for command in (["run", str(path), "--realtime", "--out", str(tmp_path), *bus], ["plant", str(path), *bus]):
+    for command in (["run", str(path), "--realtime", "--out", str(tmp_path / "run"), *bus], ["plant", str(path), *bus]):
         assert status_of(command, monkeypatch) == 2
         line = capsys.readouterr().err
         assert "scenario 'hover': fault[1].kind: only a flight in lockstep kills the firmware; fly without --realtime" in line
@@ -237,6 +237,21 @@ def test_files_that_no_run_left_are_not_written_over(
     assert f"{tmp_path} holds {name}, which no {run} left there; move what is yours or give another --out" in line
     assert line.count("\n") == 1
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, '{"mine": true}')]
+
+
+@pytest.mark.parametrize("others", [["README.md"], ["campaign.json", "trials.csv", "trials.jsonl"]], ids=["documents", "campaign"])
+def test_flight_is_not_scattered_among_other_files(
+    others: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in others:
+        (tmp_path / name).write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    for out in (str(tmp_path), "."):
+        assert status_of(["run", "hover", "--out", out], monkeypatch) == 2
+        line = capsys.readouterr().err
+        assert f"{out} holds {others[0]}" in line and "give an --out that is empty, new, or an earlier flight's" in line
+        assert line.count("\n") == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == others
 
 
 def test_trials_that_are_none_are_not_written_over(
