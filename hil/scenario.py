@@ -12,7 +12,17 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.description.fleet import check_cell, overlaps
-from firmware_py.description.schema import DescriptionError, Source, build, did_you_mean, frozen_array, quantity, read_text, read_toml
+from firmware_py.description.schema import (
+    DescriptionError,
+    Source,
+    build,
+    did_you_mean,
+    frozen_array,
+    quantity,
+    read_text,
+    read_toml,
+    refuse_folder,
+)
 from firmware_py.description.vehicle import FACE_NAMES, find_vehicles, load_vehicle
 from hil.checks import UNBOUNDED
 from hil.plant.dock_spec import DockSpec, JamRule
@@ -291,6 +301,7 @@ def load_scenario(name: str) -> Scenario:
     elif name in scenario_names():
         path = Path(str(resources.files("hil") / "scenarios" / f"{name}.toml"))
     else:
+        refuse_folder(name)
         question, known = did_you_mean(name, scenario_names()), ", ".join(scenario_names())
         raise DescriptionError(f"scenario {name!r} is unknown; {question}there are {known}, or give a .toml file")
     table, source = read_toml(path)

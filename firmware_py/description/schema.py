@@ -177,6 +177,12 @@ def parse_toml(text: str, path: str) -> dict[str, Any]:
         raise DescriptionError(f"{path}:{match.group(1) if match else last}: not valid TOML: {str(error).splitlines()[0]}") from None
 
 
+def refuse_folder(name: str) -> None:
+    """Raises DescriptionError if `name`, which should be a shipped name or a file, is a folder."""
+    if Path(name).is_dir():
+        raise DescriptionError(f"{name}: is a folder; give a .toml file")
+
+
 def did_you_mean(word: str, known: Iterable[str]) -> str:
     """A "did you mean" question for the name in `known` that is closest to `word`; empty if none is close."""
     names, small = {name.lower(): name for name in known}, word.lower()

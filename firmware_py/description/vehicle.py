@@ -24,6 +24,7 @@ from firmware_py.description.schema import (
     limits_of,
     quantity,
     read_toml,
+    refuse_folder,
     repeated,
 )
 
@@ -257,6 +258,7 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
     elif name in vehicle_names():
         path = Path(str(resources.files("firmware_py") / "vehicles" / f"{name}.toml"))
     else:
+        refuse_folder(name)
         question, known = did_you_mean(name, vehicle_names()), ", ".join(vehicle_names())
         raise DescriptionError(f"vehicle {name!r} is unknown; {question}there are {known}, or give a .toml file")
     table, source = read_toml(path)

@@ -129,6 +129,11 @@ def test_wrong_parameter_file_is_refused_with_line_and_permitted_range(
     assert right in line
 
 
+@pytest.mark.parametrize("command", [["hil", "run", "."], ["hil", "run", "hover", "--vehicle", "."], ["vehicle", "."]])
+def test_folder_in_place_of_a_file_is_refused_as_one(command: list[str], refusal: Callable[..., str]) -> None:
+    assert refusal(*command) == "modcube: .: is a folder; give a .toml file"
+
+
 def test_folder_that_cannot_be_made_is_refused(tmp_path: Path, refusal: Callable[..., str]) -> None:
     file = tmp_path / "taken"
     file.touch()
