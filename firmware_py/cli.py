@@ -9,7 +9,7 @@ from contextlib import ExitStack
 from dataclasses import fields, replace
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from typer.exceptions import TyperException
@@ -32,6 +32,8 @@ REASONS = {errno.EEXIST: "is a file; a folder is needed"}
 """Replacements for system error texts that do not say what would be right."""
 BUS, VEHICLE, RATE_HZ = "socketcan:can0", "modcube", 100
 """Defaults of the command line, for a fleet of one module."""
+NO_NUMBER = {"int_parsing": "a whole number", "float_parsing": "a number"}
+"""What a value should be, by the parser's kind of error."""
 _STDERR = 2
 LIVE_HOST, LIVE_PORT = "127.0.0.1", 8765
 """Default address of the live view."""
@@ -258,8 +260,18 @@ def usage_error(error: TyperException) -> str:
     context = getattr(error, "ctx", None)
     command = context.command_path if context is not None else "modcube"
     known = ", ".join(getattr(context.command, "commands", ())) if context is not None else ""
-    message = " ".join(error.format_message().split()).rstrip(".") or "needs a command"
+    text = error.format_message()
+    for kind, what in NO_NUMBER.items():
+        if (detail := _detail_of(error)).get("type") == kind:
+            text = text.replace(str(detail["msg"]), f"{detail['input']!r} is not {what}")
+    message = " ".join(text.split()).rstrip(".") or "needs a command"
     return f"{command}: {message}; {f'there are {known}' if known else f'see {command} --help'}"
+
+
+def _detail_of(error: TyperException) -> dict[str, Any]:
+    """What the parser of a value says of the first thing that is wrong with it; empty for an error of another kind."""
+    tell = getattr(error.__cause__, "errors", None)
+    return dict(tell()[0]) if tell is not None else {}
 
 
 def _refuse(line: str) -> int:

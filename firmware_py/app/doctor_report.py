@@ -9,7 +9,7 @@ from pathlib import Path
 from firmware_py.app.doctor import FAILED, Finding, check_interface, check_machine, lines_of
 from firmware_py.app.doctor_bus import judge, look_at
 from firmware_py.bus.codec import Codec
-from firmware_py.bus.port import PortError, open_port
+from firmware_py.bus.port import PortError, check_kind, open_port
 from firmware_py.description.fleet import Fleet
 
 UNFIT = 1
@@ -17,7 +17,9 @@ UNFIT = 1
 
 
 def examine(fleet: Fleet, folder: Path, say: Callable[[str], None], wait: Callable[[float], None] = time.sleep) -> int:
-    """Prints the findings; returns the exit status."""
+    """Prints the findings; returns the exit status. Raises PortError for a bus of no known kind."""
+    for address in fleet.buses:
+        check_kind(address)
     codec = Codec.load()
     findings = check_machine(folder)
     for index, address in enumerate(fleet.buses):

@@ -81,7 +81,8 @@ class FlightLog:
         """Raises LogError when there is no log, and OSError when it cannot be read."""
         self.folder = folder
         if folder.is_file():
-            raise LogError(f"{folder}: is a file; give the folder that a run left, here {folder.parent}")
+            here = f", here {folder.parent}" if (folder.parent / CAN_LOG).is_file() else ", with can.log and signals.mcap"
+            raise LogError(f"{folder}: is a file; give the folder that a run left{here}")
         for name in (CAN_LOG, SIGNAL_LOG):
             if not (folder / name).is_file():
                 raise LogError(f"{folder}: no {name} there; give the folder that a run left")

@@ -260,6 +260,13 @@ def test_file_of_a_log_is_refused_with_its_folder(log: Path) -> None:
     assert str(refused.value) == f"{log / CAN_LOG}: is a file; give the folder that a run left, here {log}"
 
 
+def test_file_beside_no_log_is_not_taken_for_one_of_a_run(tmp_path: Path) -> None:
+    (tmp_path / "hexa.toml").touch()
+    with pytest.raises(LogError) as refused:
+        replay(tmp_path / "hexa.toml")
+    assert str(refused.value).endswith("is a file; give the folder that a run left, with can.log and signals.mcap")
+
+
 def test_sent_line_that_is_no_frame_differs_in_short(log: Path) -> None:
     lines = (log / CAN_LOG).read_text().splitlines(True)
     at = next(i for i, line in enumerate(lines) if line.endswith(" T\n"))

@@ -233,6 +233,16 @@ class Port:
             raise PortError(f"{self.address}: is closed")
 
 
+LINKS: dict[str, type[Link]] = {"virtual": VirtualLink, "udp": UdpLink, "socketcan": SocketcanLink, "slcan": SlcanLink}
+"""Link of each kind of bus, the first word of its address."""
+
+
+def check_kind(address: str) -> None:
+    """Raises PortError if `address` is of no known kind of bus; nothing is opened."""
+    if address.partition(":")[0] not in LINKS:
+        raise PortError(f"{address!r}: no such kind of bus; it takes {ADDRESSES}")
+
+
 def open_port(
     address: str,
     *,
@@ -251,10 +261,6 @@ def open_port(
     Raises:
         PortError: the address is wrong or the bus cannot be opened.
     """
+    check_kind(address)
     kind, _, rest = address.partition(":")
-    links: dict[str, type[Link]] = {
-        "virtual": VirtualLink, "udp": UdpLink, "socketcan": SocketcanLink, "slcan": SlcanLink
-    }
-    if kind not in links:
-        raise PortError(f"{address!r}: no such kind of bus; it takes {ADDRESSES}")
-    return Port(address, links[kind](rest), reader, now_ns, arrival or threading.Event())
+    return Port(address, LINKS[kind](rest), reader, now_ns, arrival or threading.Event())
