@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -17,7 +18,7 @@ from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError, frozen_array
 from firmware_py.prepare import paths
 from firmware_py.prepare.assembly import assemble_fleet
-from firmware_py.prepare.waypoints import Mission, read_mission
+from firmware_py.prepare.waypoints import Mission, line_of, read_mission
 from hil.orders import Orders, is_time_to_arm
 from hil.scenario import Scenario, Task
 from hil.starts import hull_levers, in_wall
@@ -28,6 +29,8 @@ APART_M, APART_DEG = 0.01, 1.0
 """Tolerance between the first waypoint and the start: allows for rounding in a spreadsheet, but is no move of its own before the task."""
 LOOKS = 500
 """Number of points of a path that are checked: every 3 cm of the longest path flown here."""
+BETWEEN = re.compile(r"between waypoints \d+ and (\d+)")
+"""How the planner names a piece that cannot be flown (prepare/minimum_snap.py)."""
 LONGER_S = 1e-6
 """Rounding tolerance of a path's duration against its task's."""
 
@@ -38,6 +41,8 @@ class Script(Orders):
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
         self._fleet = fleet
         self._task = scenario.task
+        if scenario.task.kind == "waypoints":
+            refuse_points_outside(scenario)
         start = scenario.module[0].start
         self.trajectory = TASKS[scenario.task.kind](scenario.task, rest_at(start.p_wm, start.q_wm), fleet)
         refuse_outside(self.trajectory, scenario)
@@ -57,6 +62,15 @@ class Script(Orders):
             self._armed = True
             return [Request(Action.HOLD, 0, self.trajectory.sample(0.0))]
         return [Request(Action.ARM)] if is_time_to_arm(time_ns, self._fleet) else []
+
+
+def refuse_points_outside(scenario: Scenario) -> None:
+    """Raises DescriptionError for the first waypoint of the task's file that is outside the tank."""
+    task = scenario.task
+    for k, waypoint in enumerate(read_mission(task.file_text, task.file).waypoint):
+        if not scenario.tank.holds(waypoint.position_m):
+            where = f"{task.file}:{line_of(task.file_text, task.file, k)}: waypoint {k}, at {waypoint.position_m.tolist()} m"
+            raise DescriptionError(f"{where}, is outside the tank, a {scenario.tank}; keep it inside")
 
 
 def refuse_outside(path: Trajectory, scenario: Scenario) -> None:
@@ -115,7 +129,7 @@ def _waypoints(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
         mission.check_bounded()
         path = mission.plan(assemble_fleet(fleet, vehicles_of(fleet))[0], stretch=False)
     except ValueError as error:
-        raise DescriptionError(f"{task.file}: {error}") from None
+        raise _infeasible(str(error), task) from None
     first = path.sample(0.0)
     apart_m = float(np.linalg.norm(first.p_wb - start.p_wb))
     apart_deg = math.degrees(float(np.linalg.norm(rotations.difference(start.q_wb, first.q_wb))))
@@ -125,6 +139,13 @@ def _waypoints(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
     if path.duration_s > task.duration_s + LONGER_S:
         raise DescriptionError(f"{task.file}: the path takes {path.duration_s:.7g} s, longer than task.duration_s, {task.duration_s:g} s")
     return path
+
+
+def _infeasible(what: str, task: Task) -> DescriptionError:
+    """The error for a file whose path cannot be flown: with the line of the waypoint at which a piece ends that is too fast."""
+    if (piece := BETWEEN.search(what)) is None:
+        return DescriptionError(f"{task.file}: {what}")
+    return DescriptionError(f"{task.file}:{line_of(task.file_text, task.file, int(piece[1]))}: {what}; allow more time")
 
 
 def _refuse_unbounded(mission: Mission, file: str) -> None:

@@ -29,6 +29,8 @@ FIRST_SPEED = 0.1
 MOST_LEAN = 0.2
 """Largest lean with which a body may leave a moment to buoyancy, rad. A fifth of a force along one axis then goes into another."""
 
+HOPELESS = 10.0
+"""Use of the thrusters, as a share of their range, above which no figure is given."""
 _CHECK_POINTS = 48
 """Intervals of each piece, or part of one, at whose ends attitude rates and thrusters are checked; a bound between the ends is added."""
 
@@ -318,7 +320,7 @@ def _velocity(waypoints: Sequence[Waypoint], k: int) -> np.ndarray | None:
 
 
 def _thrust_message(share: float, limit: float, where: str) -> str:
-    used, allowed = f"{100.0 * share:.0f} %", f"{100.0 * limit:.0f} %"
+    used, allowed = f"{100.0 * share:.0f} %" if share < HOPELESS else f"more than {100.0 * HOPELESS:.0f} %", f"{100.0 * limit:.0f} %"
     return f"the thrusters would be used to {used} of their range, of at most {allowed}, {where}"
 
 

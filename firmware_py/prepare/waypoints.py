@@ -133,6 +133,14 @@ def read_mission(text: str, name: str) -> Mission:
     return mission
 
 
+def line_of(text: str, name: str, waypoint: int) -> int:
+    """Line of a waypoint, counted from 0, in the text of the file called `name`, which can be read."""
+    if not name.lower().endswith(".csv"):
+        return Source(name, text).line_of(("waypoint", waypoint))
+    reader = csv.reader(io.StringIO(text), skipinitialspace=True)
+    return [reader.line_num for row in reader if row][waypoint + 1]
+
+
 def _read_csv(text: str, path: str) -> Mission:
     reader = csv.DictReader(io.StringIO(text), skipinitialspace=True, restkey="")
     try:
