@@ -11,13 +11,14 @@ from typing import Annotated
 import typer
 
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
-from firmware_py.description.schema import DescriptionError, did_you_mean
+from firmware_py.description.schema import DescriptionError, did_you_mean, read_toml
 from firmware_py.runtime.folders import folder_of
 from firmware_py.runtime.interrupts import ended_at_once, interrupted_once
 from firmware_py.runtime.recorder import CAN_LOG
-from hil.bench import DEFAULT_BUS
+from hil.bench import DEFAULT_BUS, fleet_of
 from hil.plant.world import STEP_NS
 from hil.scenario import Scenario, load_scenario, scenario_names
+from hil.script import mistake_of_flight
 
 app = typer.Typer(help="The bench: the firmware against a simulated plant on the same CAN bus.", no_args_is_help=True)
 
@@ -50,7 +51,11 @@ def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
         raise DescriptionError(f"sensors {sensors!r} is unknown; there are real, ideal")
     if sensors == "ideal":
         scenario = scenario.with_ideal_sensors()
-    return scenario.with_vehicle(vehicle) if vehicle else scenario
+    if vehicle:
+        scenario = scenario.with_vehicle(vehicle)
+    if name.endswith(".toml") and (mistake := mistake_of_flight(scenario, fleet_of(scenario, DEFAULT_BUS, 100))):
+        raise read_toml(Path(name))[1].error(*mistake)
+    return scenario
 
 
 def check_rate(rate_hz: int) -> None:

@@ -17,7 +17,7 @@ from firmware_py.core.types import Action, Outputs, Request, Setpoint
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError, frozen_array
 from firmware_py.prepare import paths
-from firmware_py.prepare.assembly import assemble_fleet
+from firmware_py.prepare.assembly import assemble_fleet, check_fleet
 from firmware_py.prepare.waypoints import Mission, line_of, read_mission
 from hil.orders import Orders, is_time_to_arm
 from hil.scenario import Scenario, Task
@@ -45,8 +45,11 @@ class Script(Orders):
             refuse_points_outside(scenario)
         start = scenario.module[0].start
         self.trajectory = TASKS[scenario.task.kind](scenario.task, rest_at(start.p_wm, start.q_wm), fleet)
-        refuse_outside(self.trajectory, scenario)
-        refuse_in_wall(self.trajectory, scenario)
+        try:
+            refuse_outside(self.trajectory, scenario)
+            refuse_in_wall(self.trajectory, scenario)
+        except DescriptionError as error:
+            raise DescriptionError(f"{scenario.task.file or f'{scenario.name}: task'}: {error}") from None
         self.ticks = scenario.task.end_ns // fleet.period_ns
         self._armed = False
         self._begun = False
@@ -64,6 +67,28 @@ class Script(Orders):
         return [Request(Action.ARM)] if is_time_to_arm(time_ns, self._fleet) else []
 
 
+def mistake_of_flight(scenario: Scenario, fleet: Fleet) -> tuple[tuple[str | int, ...], str] | None:
+    """Path of keys to an entry of the scenario's file that no flight can follow, and the error message: docked modules that no face joins,
+    and a path by the file's own numbers that leaves the tank. None where there is neither. A path from a file of its own is not planned.
+    """
+    vehicles = vehicles_of(fleet)
+    for members in scenario.groups:
+        try:
+            check_fleet(dataclasses.replace(fleet, module=tuple(fleet.module[m] for m in members)), vehicles)
+        except DescriptionError as error:
+            return ("module", members[0]), str(error)
+    if scenario.task.kind not in TASKS or scenario.task.kind == "waypoints":
+        return None
+    start = scenario.module[0].start
+    path = TASKS[scenario.task.kind](scenario.task, rest_at(start.p_wm, start.q_wm), fleet)
+    try:
+        refuse_outside(path, scenario)
+        refuse_in_wall(path, scenario)
+    except DescriptionError as error:
+        return ("task",), str(error)
+    return None
+
+
 def refuse_points_outside(scenario: Scenario) -> None:
     """Raises DescriptionError for the first waypoint of the task's file that is outside the tank."""
     task = scenario.task
@@ -79,8 +104,7 @@ def refuse_outside(path: Trajectory, scenario: Scenario) -> None:
         place = path.sample(time_s).p_wb
         if not scenario.tank.holds(place):
             where = f"after {time_s:.3g} s, at {place.round(3).tolist()} m"
-            what = scenario.task.file or f"{scenario.name}: task"
-            raise DescriptionError(f"{what}: the path leaves the tank, a {scenario.tank}, {where}; keep it inside")
+            raise DescriptionError(f"the path leaves the tank, a {scenario.tank}, {where}; keep it inside")
 
 
 def refuse_in_wall(path: Trajectory, scenario: Scenario) -> None:
@@ -90,8 +114,7 @@ def refuse_in_wall(path: Trajectory, scenario: Scenario) -> None:
     for time_s in np.linspace(0.0, path.duration_s, LOOKS).tolist():
         wanted = path.sample(time_s)
         if where := in_wall(scenario.tank, wanted.p_wb + hulls @ rotations.to_matrix(wanted.q_wb).T):
-            what = scenario.task.file or f"{scenario.name}: task"
-            raise DescriptionError(f"{what}: after {time_s:.3g} s, at {wanted.p_wb.round(3).tolist()} m, a hull is {where}; keep it inside")
+            raise DescriptionError(f"after {time_s:.3g} s, at {wanted.p_wb.round(3).tolist()} m, a hull is {where}; keep it inside")
 
 
 def _hover(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:

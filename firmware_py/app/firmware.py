@@ -10,11 +10,12 @@ from pathlib import Path
 from firmware_py.app.preparation import prepare, wish_of
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.mapping import InputCollector, OutputEncoder
+from firmware_py.bus.port import PortError, check_kind
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.types import Inputs, Outputs, PartRequest, Request
 from firmware_py.description.fleet import Fleet, load_fleet
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.schema import DescriptionError
+from firmware_py.description.schema import DescriptionError, read_toml
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from firmware_py.prepare.assembly import assemble_fleet, check_fleet
 from firmware_py.runtime.worker import InlineWorker, Worker
@@ -78,6 +79,11 @@ def vehicles_of(fleet: Fleet) -> dict[str, Vehicle]:
 def read_fleet(path: Path) -> Fleet:
     """The fleet in `path`, checked that its modules can be docked as it says. Raises DescriptionError, which names the file."""
     fleet = load_fleet(path)
+    for index, address in enumerate(fleet.buses):
+        try:
+            check_kind(address)
+        except PortError as error:
+            raise read_toml(path)[1].error(("buses", index), str(error)) from None
     try:
         check_fleet(fleet, vehicles_of(fleet))
     except DescriptionError as error:

@@ -110,6 +110,7 @@ def test_fleet_file_that_names_no_bus_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
+        (APART.replace("virtual:a", "can0"), r"fleet\.toml:\d+: buses\[0\]: 'can0': no such kind of bus; it takes virtual:NAME"),
         (APART, r"fleet\.toml: no docked face joins module 9 to module 7$"),
         (APART.replace("[2,", "[0,"), r"fleet\.toml: modules 7 and 9 overlap"),
         (

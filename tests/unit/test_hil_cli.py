@@ -90,6 +90,19 @@ def test_help_names_every_bus_that_a_flight_takes(monkeypatch: pytest.MonkeyPatc
     assert [kind for kind in ("virtual:", "udp:", "socketcan:", "slcan:") if kind not in shown] == []
 
 
+@pytest.mark.parametrize(("name", "old", "new", "why"), [
+    ("mobius-2", '"modcube"', '"bluerov2"', ":11: module[0]: no docked face joins module 2 to module 1"),
+    ("hover", "centre_m = [0.0", "centre_m = [9.0", ":18: task: the path leaves the tank, a box of 1.3 x 1.2 x 0.76 m, after 0 s"),
+])  # fmt: skip
+def test_scenario_that_no_flight_can_follow_is_refused_with_file_and_line(
+    name: str, old: str, new: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = (Path(hil.plant_process.__file__).parent / "scenarios" / f"{name}.toml").read_text(encoding="utf-8")
+    (tmp_path / "own.toml").write_text(text.replace(old, new, 1), encoding="utf-8")
+    assert status_of(["run", str(tmp_path / "own.toml"), "--out", str(tmp_path / "run")], monkeypatch) == 2
+    assert f"{tmp_path / 'own.toml'}{why}" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("command", [["run", "hover"], ["campaign", "hover"], ["plant", "hover", "--bus", "udp:239.74.163.9:43119"]])
 def test_folder_without_a_name_is_refused(
     command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
