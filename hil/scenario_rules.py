@@ -14,7 +14,7 @@ from firmware_py.description.vehicle import load_vehicle
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
 from hil.metrics import DOCKING, SHOWN, shown
-from hil.starts import hulls_in_walls
+from hil.starts import MOVE_IN, hulls_in_walls, remedy
 
 if TYPE_CHECKING:
     from hil.scenario import Check, Scenario
@@ -133,7 +133,10 @@ def _in_tank(scenario: Scenario) -> Iterator[Mistake]:
             yield (table, i, "position_m"), f"{where} with its surface's centre at [0, 0, 0]"
     for i, where in hulls_in_walls(scenario, np.zeros((1, 3)), np.zeros(1)):
         leader = next(members[0] for members in scenario.groups if i in members)
-        yield ("module", leader, "position_m"), f"the hull of module {scenario.module[i].number} is {where}; move it in by that"
+        module = scenario.module[i]
+        advice = remedy(scenario.tank, load_vehicle(module.vehicle), module.start)
+        what = f"the hull of module {module.number} is {where}; {advice}{' by that' if advice == MOVE_IN else ''}"
+        yield ("module", leader, "position_m"), what
 
 
 def _in_start(scenario: Scenario) -> Iterator[Mistake]:

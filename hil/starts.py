@@ -23,6 +23,7 @@ PITCH_M = 0.21
 """Lattice pitch of docked modules (the paper's)."""
 CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
 """(8, 3) corners of a box, as shares of its edges."""
+MOVE_IN = "move it in"
 TOUCHING_M = 1e-9
 """Tolerance for a hull that touches a wall, against rounding."""
 
@@ -70,6 +71,16 @@ def in_wall(tank: Tank, points: np.ndarray) -> str:
     return f"{deepest[wall]:.3g} m into the {wall} of the tank, a {tank}" if deepest[wall] > TOUCHING_M else ""
 
 
+def remedy(tank: Tank, vehicle: Vehicle, start: Start) -> str:
+    """What to do about a hull that starts in a wall: move it, or, if it is larger than the tank in its attitude, take another."""
+    extent = np.ptp(hull_of(vehicle, start), axis=0)
+    room = tank.size_m if tank.kind == "box" else np.array([2.0 * tank.radius_m, 2.0 * tank.radius_m, tank.depth_m])
+    if np.all(extent <= room + TOUCHING_M):
+        return MOVE_IN
+    edges = " x ".join(f"{edge:.3g}" for edge in extent)
+    return f"{vehicle.name}, {edges} m as it starts, does not fit that tank: take a larger tank or a smaller vehicle"
+
+
 def hull_levers(scenario: Scenario) -> dict[int, tuple[Start, np.ndarray]]:
     """Initial pose of the body, and (8, 3) hull corners relative to it, body frame, m; by module index, body after body."""
     vehicles = [load_vehicle(module.vehicle) for module in scenario.module]
@@ -100,7 +111,8 @@ def refuse_in_walls(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Seq
     """Raises DescriptionError when a hull would start in a wall."""
     for module, vehicle, start in zip(scenario.module, vehicles, starts, strict=True):
         if where := in_wall(scenario.tank, hull_of(vehicle, start)):
-            raise DescriptionError(f"{scenario.name}: in seed {seed} the hull of module {module.number} starts {where}; move it in")
+            what = f"in seed {seed} the hull of module {module.number} starts {where}; {remedy(scenario.tank, vehicle, start)}"
+            raise DescriptionError(f"{scenario.name}: {what}")
 
 
 def refuse_overlap(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Sequence[Start], seed: int) -> None:

@@ -72,7 +72,8 @@ def load(tmp_path: Path) -> Load:
         ("hover", "[0.0, 0.0, 0.38]", "[0.0, 0.55, 0.38]", "module[0].position_m: the hull of module 1 is 0.055 m into the wall at +y of"),
         ("hover", "[0.0, 0.0, 0.38]", "[-0.6, 0.0, 0.38]", "the hull of module 1 is 0.055 m into the wall at -x of the tank, a box of 1.3"),
         ("hover", "[0.0, 0.0, 0.38]", "[0.0, 0.0, 0.7]", "the hull of module 1 is 0.045 m into the bottom of the tank"),
-        ("hover", '"modcube"', '"girona500"', "the hull of module 1 is 0.12 m into the bottom of the tank"),
+        ("hover", '"modcube"', '"girona500"', "m; girona500, 1.5 x 1 x 1 m as it starts, does not fit that tank: take a larger tank or"),
+        ("hover", "[0.0, 0.0, 0.38]", "[0.0, 0.0, 0.7]", " m; move it in by that"),
         ("mobius-1", "[1.3, 0.0, 1.5]", "[2.4, 2.4, 1.5]", "the hull of module 1 is 0.0426 m into the wall of the tank, a cylinder"),
         ("mobius-2", "[1.3, 0.0, 1.5]", "[0.0, -3.3, 1.5]", "module[0].position_m: the hull of module 1 is 0.0116 m into the wall of the"),
         ("hover", "", "[start]\nposition_m = [0.0, 0.5, 0.0]", "start: a seed may start the hull of module 1 0.005 m into the wall at +y"),
@@ -355,6 +356,11 @@ def test_bodies_that_would_start_one_inside_the_other_are_refused() -> None:
 @pytest.mark.parametrize("place", ["[0.545, -0.495, 0.655]", "[0.0, 0.0, 0.0]"], ids=["touches_three_walls", "floats"])
 def test_hull_that_touches_a_wall_or_floats_is_put_into_the_water(load: Load, place: str) -> None:
     make_world(load("hover", "[0.0, 0.0, 0.38]", place), 0, 10_000_000)
+
+
+def test_vehicle_that_does_not_fit_the_tank_is_not_asked_to_be_moved() -> None:
+    with pytest.raises(DescriptionError, match=r"girona500, 1\.5 x 1 x 1 m as it starts, does not fit that tank: take a larger tank or"):
+        make_world(load_scenario("hover").with_vehicle("girona500"), 0, 10_000_000)
 
 
 @pytest.mark.slow
