@@ -166,7 +166,7 @@ def campaign(
     unusual = unusual_in(vehicle, controller, sensors)
     folder = out if out is not None else Path("runs") / "-".join([chosen.name, *unusual, "campaign"])
     parameters, seeds = parameters_of(controller), range(seed, seed + trials)
-    with _report_resume_on_interrupt(), campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
+    with _report_resume_on_interrupt(), interrupted_once(), campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
         pool = dask_cluster(dask) if dask else processes(jobs)
         summary = run_campaign(chosen, parameters, seeds, pool, folder, progress)
     print_campaign(summary)
@@ -207,7 +207,7 @@ def _fly_faults(jobs: int, seed: int, out: Path | None) -> int:
     from hil.scenario import MODES
     from hil.workers import processes
 
-    with campaign_progress("every fault in every mode", len(ROWS) * len(MODES)) as progress:
+    with interrupted_once(), campaign_progress("every fault in every mode", len(ROWS) * len(MODES)) as progress:
         cells = run_fault_campaign(processes(jobs), out if out is not None else Path("runs") / "faults-campaign", seed, progress)
     print_faults(cells)
     return FAILED if any(cell.broken for cell in cells) else 0

@@ -1,6 +1,7 @@
 """The bench's command line: an option that does not apply is refused in one line, and nothing flies."""
 
 import json
+import signal
 from importlib import resources
 from pathlib import Path
 
@@ -68,6 +69,19 @@ def test_interrupted_campaign_says_that_it_goes_on(
 
     monkeypatch.setattr(hil.campaign, "run_campaign", interrupt)
     assert status_of(["campaign", "hover", "--out", str(tmp_path)], monkeypatch) == INTERRUPTED
+    assert capsys.readouterr().err == "modcube: interrupted; the same command goes on where it was\n"
+
+
+def test_campaign_that_is_terminated_from_elsewhere_says_that_it_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    monkeypatch.setattr(hil.campaign, "run_campaign", lambda *_: signal.raise_signal(signal.SIGTERM))
+    try:
+        assert status_of(["campaign", "hover", "--out", str(tmp_path)], monkeypatch) == INTERRUPTED
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
     assert capsys.readouterr().err == "modcube: interrupted; the same command goes on where it was\n"
 
 
