@@ -68,10 +68,14 @@ def print_campaign(summary: Mapping[str, Any], console: Console | None = None) -
     """Prints the table, the kinds of failure, the seeds to look at first, and the correlated parameters."""
     console = console or Console()
     console.print(campaign_table(summary))
-    failures = [f"{name} {count}" for name, count in summary["outcomes"].items() if name != "passed"]
+    failures = {name: count for name, count in summary["outcomes"].items() if name != "passed"}
     if failures:
-        console.print(f"FAILED: {', '.join(failures)}", style="bold red", highlight=False)
-    console.print(f"worst seeds: {', '.join(str(seed) for seed in summary['worst_seeds'])}", highlight=False)
+        causes = ", ".join(f"{shown(name).label}{f' ({count})' if len(failures) > 1 else ''}" for name, count in failures.items())
+        failed = f"{sum(failures.values())} of {summary['trials']} failed"
+        console.print(f"{failed}: {causes}", style="bold red", highlight=False, soft_wrap=True)
+    if len(summary["worst_seeds"]) < summary["trials"] or failures:
+        named = ", ".join(str(seed) for seed in summary["worst_seeds"])
+        console.print(f"worst seeds: {named}", highlight=False)
     looked_at = {metric: summary["sensitivities"].get(metric, {}) for metric in SENSITIVITY_METRICS}
     pairs = sum(len(correlations) for correlations in looked_at.values())
     for metric, correlations in looked_at.items():

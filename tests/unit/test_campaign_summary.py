@@ -96,8 +96,15 @@ def test_table_of_a_campaign_shows_units_failures_and_worst_seeds() -> None:
     text = console.file.getvalue()  # type: ignore[attr-defined]
     assert "3 of 4 passed" in text
     assert "4.50 mm" in text
-    assert "FAILED: position_rmse_m 1" in text
+    assert "1 of 4 failed: Position RMSE, truth against reference" in text
     assert "worst seeds: 1, 3, 2, 0" in text
+
+
+def test_campaign_that_passed_names_no_worst_seeds_where_those_are_all() -> None:
+    said = io.StringIO()
+    print_campaign(summarise("spiral", [{**each, "passed": True, "outcome": "passed"} for each in TRIALS]), Console(file=said, width=120))
+    assert "4 of 4 passed" in said.getvalue()
+    assert "worst seeds" not in said.getvalue()
 
 
 def test_progress_of_a_campaign_leaves_no_trace_in_a_file() -> None:
