@@ -125,7 +125,7 @@ def judge_logs(
         metrics["unmatched_ticks"] = max(metrics["unmatched_ticks"], float(ticks_of(scenario, period_ns) - len(flight.firmware["tick"])))
     if scenario.task.kind == "force":
         metrics |= force_metrics(scenario, folder, begin_ns)
-    always = [Limit("unmatched_ticks", high=lost_share * len(flight.firmware["tick"])), *_armed_at_all(scenario, whole, folder)]
+    always = [Limit("unmatched_ticks", high=math.floor(lost_share * len(flight.firmware["tick"]))), *_armed_at_all(scenario, whole, folder)]
     result = judge(scenario.name, seed, metrics, [*scenario.check, *always], warning_lines(whole.events, start_of(whole)))
     return result if result.passed else result._replace(no_tag_reason=no_tag_reason(scenario, whole))
 

@@ -108,7 +108,8 @@ def shown_value(metric: str, value: float) -> str:
         return "none"
     if how.words:
         return how.words[round(value)]
-    return f"{value * how.scale:.{how.digits}f} {how.unit}".rstrip()
+    rounded = round(value * how.scale, how.digits) + 0.0  # without the sign of a negative zero
+    return f"{rounded:.{how.digits}f} {how.unit}".rstrip()
 
 
 def shown_limit(metric: str, low: float, high: float) -> str:

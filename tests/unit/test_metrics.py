@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.runtime.recorder import Recorder
 from hil.checks import Limit, check_metrics, judge, write_result
-from hil.flight import passive_in, ticks_of
+from hil.flight import judge_logs, passive_in, ticks_of
 from hil.force_metrics import force_metrics
 from hil.metrics import Poses, flight_metrics, nis_mean, passive_words, rate_rms, rotation_vectors, shown, warnings
 from hil.scenario import load_scenario
@@ -217,3 +217,11 @@ def test_task_has_a_tick_at_either_end(settle_s: float, duration_s: float, ticks
     scenario = load_scenario("hover")
     scenario = dataclasses.replace(scenario, task=dataclasses.replace(scenario.task, settle_s=settle_s, duration_s=duration_s))
     assert ticks_of(scenario, 10_000_000) == ticks
+
+
+def test_ticks_that_a_log_may_lack_are_a_whole_number(tmp_path: Path) -> None:
+    write_flight(tmp_path, duration_s=2.0)
+    scenario = load_scenario("hover")
+    task = dataclasses.replace(scenario.task, settle_s=0.0, duration_s=1.5)
+    result = judge_logs(dataclasses.replace(scenario, task=task), 0, tmp_path, lost_share=0.0133)
+    assert [check.limit for check in result.checks if check.name == "unmatched_ticks"] == ["<= 2"]

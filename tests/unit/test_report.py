@@ -296,6 +296,7 @@ def test_values_are_shown_in_units_that_people_read() -> None:
     assert shown_value("attitude_rmse_rad", math.radians(1.5)) == "1.50 deg"
     assert shown_value("sigma3_share", 0.97) == "97.0 %"
     assert shown_value("nis_mean", math.nan) == "none"
+    assert shown_value("gap_min_m", -1e-7) == "0.00 mm"
     assert shown_value("docking_tries", 3.0) == "3.0000"
     assert shown_limit("position_rmse_m", -1e9, 0.005) == "<= 5 mm"
     assert shown_limit("sigma3_share", 0.97, math.inf) == ">= 97 %"
