@@ -49,8 +49,22 @@ class Check(NamedTuple):
         return limit_text(self.low, self.high)
 
 
+class Flown(NamedTuple):
+    """What flew."""
+
+    version: str = ""
+    """Version of modcube."""
+    controller: str = ""
+    """Name of its parameters; `own` for those of a file."""
+    vehicles: tuple[str, ...] = ()
+    """Names of the vehicles, each once, in the order of the modules."""
+
+    def __str__(self) -> str:
+        return f"modcube {self.version}, controller {self.controller}, vehicle {', '.join(self.vehicles)}"
+
+
 class Result(NamedTuple):
-    """The result of a run. result.json holds all of it but `warnings` and `no_tag_reason`."""
+    """The result of a run. result.json holds all of it but `no_tag_reason`."""
 
     scenario: str
     seed: int
@@ -61,6 +75,7 @@ class Result(NamedTuple):
     """Warnings of the firmware, a line each (hil.metrics.warning_lines)."""
     unusual: tuple[str, ...] = ()
     """Options that differ from the scenario or the defaults: vehicle, controller, sensors."""
+    what: Flown = Flown()
     no_tag_reason: str = ""
     """Why no tag was seen, in words, if the flight could not be flown for that reason."""
 
@@ -100,6 +115,7 @@ def write_result(result: Result, folder: Path) -> Path:
     plain = {
         "scenario": result.scenario,
         "seed": result.seed,
+        **result.what._asdict(),
         "unusual": list(result.unusual),
         "passed": result.passed,
         "metrics": {name: _number(value) for name, value in result.metrics.items()},
@@ -107,6 +123,7 @@ def write_result(result: Result, folder: Path) -> Path:
             {"name": check.name, "value": _number(check.value), "limit": check.limit, "passed": check.passed}
             for check in result.checks
         ],
+        "warnings": list(result.warnings),
     }
     path = folder / RESULT_FILE
     path.write_text(json.dumps(plain, indent=2, allow_nan=False) + "\n", encoding="utf-8")

@@ -9,19 +9,20 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 
 from firmware_py.core.transitions import ARMED
-from firmware_py.description.parameters import Parameters
+from firmware_py.description.parameters import CONTROLLERS, Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.signals import read_signals
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import groups_of, passive_axes
 from firmware_py.runtime.recorder import CAN_LOG
 from hil.bench import DEFAULT_BUS, SCRIPTS, fleet_of, fly_scenario
-from hil.checks import RESULT_FILE, Limit, Result, judge, write_result
+from hil.checks import RESULT_FILE, Flown, Limit, Result, judge, write_result
 from hil.dock_plot import DOCK_PLOT, write_dock_plot
 from hil.docking_metrics import docking_metrics
 from hil.force_metrics import force_metrics
@@ -71,9 +72,16 @@ def fly_and_judge(
             result = judge_logs(scenario, seed, out, flown.wall_s, flown.deadline_misses, LATE_SHARE)
         else:
             result = judge_logs(scenario, seed, out, fly_scenario(*flight, before_logs=partial(_clear, out)))
-        result = result._replace(unusual=tuple(unusual))
+        result = result._replace(unusual=tuple(unusual), what=flown_of(scenario, parameters))
         write_result(result, out)
     return result
+
+
+def flown_of(scenario: Scenario, parameters: Parameters) -> Flown:
+    """What flies `scenario` with `parameters`."""
+    controller = next((name for name, known in CONTROLLERS.items() if known == parameters), "own")
+    vehicles = dict.fromkeys(load_vehicle(module.vehicle).name for module in scenario.module)
+    return Flown(version("modcube"), controller, tuple(vehicles))
 
 
 def check_folder(folder: Path) -> None:

@@ -90,7 +90,7 @@ def write_report(folder: Path, result: Result, flight: Flight, scene: Scene, plo
         "table": _table(result),
         "told": _told(result),
         "plots": "\n".join(_plot(path) for path in plots),
-        "notes": "\n".join(f"<p>{html.escape(note)}</p>" for note in (NOT_MEASURED, *scene.notes)),
+        "notes": "\n".join(f"<p>{html.escape(note)}</p>" for note in (f"Flown: {result.what}.", NOT_MEASURED, *scene.notes)),
         "style": _asset("style.css"),
         "viewer": _asset("viewer.js"),
         "data": json.dumps(animation(flight, scene), separators=(",", ":")).replace("<", "\\u003c"),

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from firmware_py.runtime.recorder import Recorder
-from hil.checks import Limit, check_metrics, judge, write_result
+from hil.checks import Flown, Limit, check_metrics, judge, write_result
 from hil.flight import judge_logs, passive_in, ticks_of
 from hil.force_metrics import force_metrics
 from hil.metrics import Poses, flight_metrics, nis_mean, passive_words, rate_rms, rotation_vectors, shown, warnings
@@ -163,10 +163,15 @@ def test_run_passes_only_when_every_check_does() -> None:
 
 def test_result_file_has_the_agreed_shape(tmp_path: Path) -> None:
     metrics = {"position_rmse_m": 0.0026, "nis_mean": math.nan, "ticks": 4001.0}
-    path = write_result(judge("spiral", 3, metrics, LIMITS)._replace(unusual=("paper", "ideal")), tmp_path)
+    result = judge("spiral", 3, metrics, LIMITS, ("1.0 s: leak",))
+    what = Flown("0.1.0", "paper", ("modcube",))
+    path = write_result(result._replace(unusual=("paper", "ideal"), what=what), tmp_path)
     assert json.loads(path.read_text()) == {
         "scenario": "spiral",
         "seed": 3,
+        "version": "0.1.0",
+        "controller": "paper",
+        "vehicles": ["modcube"],
         "unusual": ["paper", "ideal"],
         "passed": False,
         "metrics": {"position_rmse_m": 0.0026, "nis_mean": None, "ticks": 4001},
@@ -174,6 +179,7 @@ def test_result_file_has_the_agreed_shape(tmp_path: Path) -> None:
             {"name": "position_rmse_m", "value": 0.0026, "limit": "<= 0.005", "passed": True},
             {"name": "nis_mean", "value": None, "limit": "0.7 to 1.4", "passed": False},
         ],
+        "warnings": ["1.0 s: leak"],
     }
 
 

@@ -6,6 +6,7 @@ import io
 import json
 import math
 import re
+from importlib.metadata import version
 from pathlib import Path
 
 import matplotlib
@@ -15,10 +16,11 @@ from matplotlib import pyplot
 from rich.console import Console
 
 from firmware_py.core.types import NEVER_AGE_NS
+from firmware_py.description.parameters import CONTROLLERS
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import UNBOUNDED, Limit, Result, judge
 from hil.console import flight_progress, print_result
-from hil.flight import as_wanted, wanted_in
+from hil.flight import as_wanted, flown_of, wanted_in
 from hil.force_metrics import force_names
 from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, warning_lines
 from hil.plots import (
@@ -124,6 +126,12 @@ def test_report_needs_no_network_and_carries_its_plots(flight: Flight, result: R
     sources = re.findall(r'src="([^"]*)"', page)
     assert sources == ["data:image/png;base64," + base64.b64encode(plot.read_bytes()).decode()]
     assert "<!--" not in page.replace("<!DOCTYPE", "")
+
+
+def test_report_names_what_flew(flight: Flight, result: Result, tmp_path: Path) -> None:
+    flown = result._replace(what=flown_of(load_scenario("hover"), CONTROLLERS["least_power"]))
+    page = write_report(tmp_path, flown, flight, scene(), []).read_text()
+    assert f"<p>Flown: modcube {version('modcube')}, controller least_power, vehicle modcube.</p>" in page
 
 
 def test_report_shows_our_figure_beside_the_papers(flight: Flight, result: Result, tmp_path: Path) -> None:
