@@ -20,7 +20,7 @@ from firmware_py.description.parameters import CONTROLLERS
 from firmware_py.description.vehicle import load_vehicle
 from hil.checks import UNBOUNDED, Limit, Result, judge
 from hil.console import flight_progress, print_result
-from hil.flight import as_wanted, flown_of, wanted_in
+from hil.flight import _scene, as_wanted, flown_of, wanted_in
 from hil.force_metrics import force_names
 from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, warning_lines
 from hil.plots import (
@@ -126,6 +126,12 @@ def test_report_needs_no_network_and_carries_its_plots(flight: Flight, result: R
     sources = re.findall(r'src="([^"]*)"', page)
     assert sources == ["data:image/png;base64," + base64.b64encode(plot.read_bytes()).decode()]
     assert "<!--" not in page.replace("<!DOCTYPE", "")
+
+
+def test_only_the_papers_vehicle_is_shown_beside_the_paper(flight: Flight) -> None:
+    spiral = load_scenario("spiral")
+    assert _scene(spiral, flight).paper_rmse_mm == 20.92
+    assert _scene(spiral.with_vehicle("bluerov2"), flight).paper_rmse_mm is None
 
 
 def test_report_names_what_flew(flight: Flight, result: Result, tmp_path: Path) -> None:
