@@ -17,6 +17,8 @@ PLOTS = ("overview", "position", "attitude", "estimate", "thrusters", "disturban
 """Names of the files, without .png."""
 NOT_JUDGED = "before or after the task, not judged"
 """Meaning of grey in every plot over time."""
+JOINED = "modules join or part: the origin moves"
+"""Meaning of a vertical line in every plot over time."""
 ROUNDING_S = 1e-6
 MODULE_COLUMNS = 4
 """Modules whose thrusters are plotted side by side."""
@@ -84,6 +86,11 @@ def write_plots(
 
         for name in PLOTS:
             figure = figures[name]()
+            if name not in ("overview", "thrusters") and len(flight.modules) > 1:
+                leader = f"module {numbers[0] if numbers else 1}"
+                text = f"The body that {leader} leads; truth of the other modules is dotted while they are apart"
+                text = text if name == "position" else text.partition(";")[0]
+                figure.suptitle(text, x=0.01, ha="left", fontsize=11)
             paths.append(folder / f"{name}.png")
             figure.savefig(paths[-1], metadata={"Software": None})
             pyplot.close(figure)
@@ -161,8 +168,11 @@ def position(flight: Flight, window: Window) -> Any:
     cells = figure.subplots(3, 2, sharex=True)
     truth = flight.p_wb
     wanted, believed = (_once_placed(flight, flight.firmware[name]) for name in ("setpoint_p_wb", "p_wb"))
+    apart = _apart(flight)
     for axis, name in enumerate(("x (north)", "y (east)", "z (down)")):
         left, right = cells[axis]
+        for path in apart:
+            left.plot(flight.time_s, path[:, axis], color=COMMAND, linestyle=":", label="truth, another module")
         left.plot(flight.time_s, believed[:, axis], color=ESTIMATE, linewidth=3.0, alpha=0.55, label="estimate")
         left.plot(flight.time_s, truth[:, axis], color=TRUTH, label="truth")
         left.plot(flight.time_s, wanted[:, axis], color=REFERENCE, linestyle="--", label="reference")
@@ -257,7 +267,7 @@ def thrusters(flight: Flight, window: Window, force_limits_n: np.ndarray, number
     Args:
         numbers: module numbers in fleet order; 1, 2, ... by default.
     """
-    commanded, given = flight.firmware["commanded_n"], flight.truth["force_n"]
+    commanded, given = flight.firmware["commanded_n"], _forces(flight)
     names = _module_names(flight, numbers)
     per = given.shape[1] // len(names)
     names += ["Docked for the firmware alone"] * (commanded.shape[1] // per - len(names))
@@ -286,11 +296,19 @@ def thrusters(flight: Flight, window: Window, force_limits_n: np.ndarray, number
     return figure
 
 
+def _forces(flight: Flight) -> np.ndarray:
+    """(k, n) true forces of all thrusters of the modules that were in the body, also while a module was apart."""
+    ever = np.flatnonzero((flight.truth["member"] > 0.0).any(axis=0))
+    if len(flight.modules) < 2:
+        return flight.truth["force_n"]
+    return np.hstack([flight.modules[m]["force_n"] for m in ever])
+
+
 def _module_names(flight: Flight, numbers: Sequence[int]) -> list[str]:
     """Names of the modules that were in the body, in the order of its true forces."""
     member = flight.truth["member"] > 0.0
     every = [f"Module {number}" for number in numbers or range(1, 1 + member.shape[1])]
-    return [every[m] + ("" if member[:, m].all() else ", while docked") for m in np.flatnonzero(member.any(axis=0))]
+    return [every[m] + ("" if member[:, m].all() else ", commands while docked") for m in np.flatnonzero(member.any(axis=0))]
 
 
 def _columns_of(modules: int, per: int) -> np.ndarray:
@@ -370,12 +388,21 @@ def _finish_time_axis(axes: Any, flight: Flight, window: Window, last: bool = Fa
     for low, high in ((0.0, window.start_s), (window.end_s, end_s)):
         if high - low > 0.05:
             axes.axvspan(low, high, color=GREY, zorder=0, linewidth=0, label=NOT_JUDGED)
+    for at_s in _joins_s(flight):
+        axes.axvline(at_s, color=REFERENCE, linestyle="-.", linewidth=0.8, label=JOINED)
     if last:
         axes.set_xlabel("time (s)")
 
 
+def _joins_s(flight: Flight) -> list[float]:
+    """Times at which the firmware steers another number of thrusters than before, s."""
+    count = np.isfinite(flight.firmware["commanded_n"]).sum(axis=1)
+    return [float(at_s) for at_s in flight.time_s[1:][np.diff(count) != 0]]
+
+
 def _legends_below(figure: Any, cells: Any) -> None:
-    """One legend for the whole figure, below it, with grey last."""
+    """One legend for the whole figure, below it, with grey last; many entries take two rows."""
     handles = {label: handle for cell in cells for handle, label in zip(*cell.get_legend_handles_labels(), strict=True)}
     handles = dict(sorted(handles.items(), key=lambda item: item[0] == NOT_JUDGED))
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=len(handles))
+    columns = len(handles) if len(handles) < 6 else -(-len(handles) // 2)
+    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns)

@@ -13,6 +13,7 @@ import matplotlib
 import numpy as np
 import pytest
 from matplotlib import pyplot
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from firmware_py.core.types import NEVER_AGE_NS
@@ -25,6 +26,7 @@ from hil.force_metrics import force_names
 from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, warning_lines
 from hil.plots import (
     GREY,
+    JOINED,
     NOT_JUDGED,
     STYLE,
     Window,
@@ -274,6 +276,23 @@ def test_overview_of_a_dock_shows_the_other_module_until_it_joins(dock: Flight) 
     pyplot.close(figure)
 
 
+def test_position_of_a_dock_shows_the_other_module_and_when_the_origin_moves(dock: Flight) -> None:
+    figure = position(dock, Window(0.0, 2.0))
+    lines = {line.get_label(): line for line in figure.axes[0].lines}
+    assert np.isfinite(lines["truth, another module"].get_ydata()).sum() == 100
+    assert lines[JOINED].get_xdata() == pytest.approx([1.12, 1.12])
+    assert {JOINED, "truth, another module"} <= {text.get_text() for text in figure.legends[0].get_texts()}
+    pyplot.close(figure)
+
+
+def test_plots_of_a_dock_say_whose_body_they_show(dock: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, path, **_: said.append(f"{path.stem}: {figure.get_suptitle()}"))
+    write_plots(dock, tmp_path, Window(0.0, 2.0), TANK_M, np.array([-8.0, 10.0]), numbers=(3, 7))
+    for name in ("position", "attitude", "estimate", "disturbance"):
+        assert any(each.startswith(f"{name}: The body that module 3 leads") for each in said)
+
+
 @pytest.mark.slow
 def test_thrusters_that_joined_later_stay_inside_their_axes(dock: Flight) -> None:
     with matplotlib.rc_context(STYLE):  # type: ignore[arg-type]
@@ -285,13 +304,13 @@ def test_thrusters_that_joined_later_stay_inside_their_axes(dock: Flight) -> Non
 def test_thrusters_of_each_module_stand_in_a_column_under_its_name(dock: Flight) -> None:
     figure = thrusters(dock, Window(0.0, 2.0), np.array([-8.0, 10.0]), numbers=(3, 7))
     columns = {number: [axes for axes in figure.axes if axes.get_subplotspec().colspan.start == number] for number in range(2)}
-    for column, (name, newton) in enumerate((("Module 3", 2.0), ("Module 7, while docked", 3.0))):
+    for column, (name, newton) in enumerate((("Module 3", 2.0), ("Module 7, commands while docked", 3.0))):
         titles = [axes.get_title(loc="left") or axes.get_title() for axes in columns[column]]
         assert titles == [name] + [""] * 7
         assert [axes.get_ylabel() for axes in columns[column]] == [f"T{i}, N" for i in range(1, 9)]
         for axes in columns[column]:
             (truth,) = (line.get_ydata() for line in axes.lines if line.get_label() == "truth")
-            assert np.nanmax(truth) == np.nanmin(truth) == newton
+            assert np.max(truth) == np.min(truth) == newton, "also while the module was apart"
     pyplot.close(figure)
 
 
