@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from firmware_py.description.signals import Columns, read_signals
-from hil.plots import STYLE
+from hil.plot_style import STYLE
 from hil.signals import SIGNAL_LOG, rows_of
 from hil.truth_log import TRUTH_LOG
 

@@ -226,7 +226,7 @@ def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:
     flight = as_wanted(scenario, dataclasses.replace(read_flight(folder), passive=passive_in(scenario)))
     scene = _scene(scenario, flight)
     numbers = [module.number for module in scenario.module]
-    plots = write_plots(flight, folder, scene.window, scene.tank_m, scene.force_limits_n, scene.paper_rmse_mm, numbers)
+    plots = write_plots(flight, folder, scene.window, scene.tank_m, scene.force_limits_n, scene.paper_rmse_mm, numbers, scene.tank)
     plots += write_dock_plot(folder, start_of(flight))
     return write_report(folder, result, flight, scene, plots)
 

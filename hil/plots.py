@@ -9,10 +9,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from hil.metrics import errors, nis_mean, passive_words, refused, rms, rotation_vectors
+from hil.path_plot import apart, path_3d
+from hil.plot_style import AXIS_COLOURS, COMMAND, ESTIMATE, GREY, REFERENCE, STYLE, TRUTH
 from hil.signals import Flight
 
-TRUTH, ESTIMATE, REFERENCE, COMMAND = "#0072b2", "#e69f00", "#30363d", "#009e73"
-"""One colour per kind of signal in every plot (Okabe and Ito's palette, safe for colour-blind readers)."""
 PLOTS = ("overview", "position", "attitude", "estimate", "thrusters", "disturbance")
 """Names of the files, without .png."""
 NOT_JUDGED = "before or after the task, not judged"
@@ -22,23 +22,6 @@ JOINED = "modules join or part: the origin moves"
 ROUNDING_S = 1e-6
 MODULE_COLUMNS = 4
 """Modules whose thrusters are plotted side by side."""
-GREY = "#e4e9ee"
-AXIS_COLOURS = ("#cc3311", "#009988", "#0077bb")
-STYLE: dict[str, Any] = {
-    "font.size": 10,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "axes.titlesize": 11,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "grid.color": "#d8dee4",
-    "grid.linewidth": 0.6,
-    "lines.linewidth": 1.4,
-    "legend.frameon": False,
-    "figure.dpi": 110,
-    "savefig.facecolor": "white",
-}
 
 
 class Window(NamedTuple):
@@ -56,6 +39,7 @@ def write_plots(
     force_limits_n: np.ndarray,
     paper_rmse_mm: float | None = None,
     numbers: Sequence[int] = (),
+    tank: str = "box",
 ) -> list[Path]:
     """Write all plots of a flight into `folder`.
 
@@ -65,6 +49,7 @@ def write_plots(
         force_limits_n: (2,) reverse and forward limit of each thruster, N.
         paper_rmse_mm: the paper's measurement in the same task, for comparison.
         numbers: module numbers in fleet order; 1, 2, ... by default.
+        tank: `box` or `cylinder`.
 
     Returns:
         their paths, the overview first.
@@ -73,7 +58,7 @@ def write_plots(
 
     matplotlib.use("Agg")
     figures = {
-        "overview": lambda: overview(flight, window, tank_m, paper_rmse_mm),
+        "overview": lambda: overview(flight, window, tank_m, paper_rmse_mm, tank),
         "position": lambda: position(flight, window),
         "attitude": lambda: attitude(flight, window),
         "estimate": lambda: estimate(flight, window),
@@ -97,19 +82,19 @@ def write_plots(
     return paths
 
 
-def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: float | None) -> Any:
+def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: float | None, tank: str = "box") -> Any:
     """3D path, with the size of position and attitude error beside it."""
     figure = _figure(11.0, 5.5)
     grid = figure.add_gridspec(2, 2, width_ratios=(1.05, 1.0))
     inside = _inside(flight, window)
-    _path_3d(figure.add_subplot(grid[:, 0], projection="3d"), flight, tank_m, inside)
+    path_3d(figure.add_subplot(grid[:, 0], projection="3d"), flight, tank_m, inside, tank)
     time_s = flight.time_s
     error_m, angle_rad = errors(flight)
     rows = ((1e3 * error_m, "mm", "Position", ""), (np.degrees(angle_rad), "deg", "Attitude", passive_words(flight)))
     for row, (values, unit, what, without) in enumerate(rows):
         axes = figure.add_subplot(grid[row, 1])
         rmse = rms(values[inside])
-        axes.plot(time_s, _once_placed(flight, values), color=TRUTH, linewidth=1.0)
+        axes.plot(time_s, _once_steered(flight, values), color=TRUTH, linewidth=1.0)
         axes.axhline(rmse, color=REFERENCE, linestyle="--", linewidth=1.2, label=f"RMSE {rmse:.2f} {unit}")
         if row == 0 and paper_rmse_mm is not None:
             paper = f"paper's robot, real tank: RMSE {paper_rmse_mm:g} mm"
@@ -130,36 +115,11 @@ def _once_placed(flight: Flight, values: np.ndarray) -> np.ndarray:
     return np.where(flight.placed.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
 
 
-def _path_3d(axes: Any, flight: Flight, tank_m: np.ndarray, inside: np.ndarray) -> None:
-    low, high = tank_m
-    for fixed in range(3):
-        a, b = (i for i in range(3) if i != fixed)
-        for corner_a in (low[a], high[a]):
-            for corner_b in (low[b], high[b]):
-                line = np.empty((2, 3))
-                line[:, fixed], line[:, a], line[:, b] = (low[fixed], high[fixed]), corner_a, corner_b
-                axes.plot(*line.T, color="#9fb4c7", linewidth=0.9)
-    wanted = flight.firmware["setpoint_p_wb"][inside]
-    axes.plot(*wanted.T, color=REFERENCE, linestyle="--", linewidth=1.1, label="reference")
-    axes.plot(*flight.p_wb.T, color=TRUTH, linewidth=1.6, label="truth")
-    for index, path in enumerate(_apart(flight)):
-        axes.plot(*path.T, color=COMMAND, linewidth=1.2, label=None if index else "truth, another module")
-    axes.scatter(*flight.p_wb[0], color=TRUTH, s=28, label="start")
-    for which, text in (("x", "north x (m)"), ("y", "east y (m)"), ("z", "down z (m)")):
-        getattr(axes, f"set_{which}label")(text, labelpad=7)
-    axes.set(xlim=(low[0], high[0]), ylim=(high[1], low[1]), zlim=(high[2], low[2]))
-    # y is reversed together with z: reversing only one of them would mirror the picture.
-    axes.set_box_aspect(high - low, zoom=0.93)
-    axes.locator_params(nbins=5)
-    axes.view_init(elev=22, azim=-58)
-    axes.set_title("Path in the tank")
-    axes.legend(loc="upper left", fontsize=9)
-
-
-def _apart(flight: Flight) -> list[np.ndarray]:
-    """(k, 3) paths of the modules that are outside the body at some time; NaN while they are inside."""
-    outside = flight.truth["member"] == 0.0
-    return [np.where(outside[:, [m]], module["p_wm"], np.nan) for m, module in enumerate(flight.modules) if outside[:, m].any()]
+def _once_steered(flight: Flight, values: np.ndarray) -> np.ndarray:
+    """(k, ...) the values as floats, NaN before the firmware has a reference of its own: until it is armed, that is the estimate."""
+    own = np.any(flight.firmware["setpoint_p_wb"] != flight.firmware["p_wb"], axis=1)
+    steered = np.logical_or.accumulate(own & flight.placed)
+    return np.where(steered.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
 
 
 def position(flight: Flight, window: Window) -> Any:
@@ -168,16 +128,16 @@ def position(flight: Flight, window: Window) -> Any:
     cells = figure.subplots(3, 2, sharex=True)
     truth = flight.p_wb
     wanted, believed = (_once_placed(flight, flight.firmware[name]) for name in ("setpoint_p_wb", "p_wb"))
-    apart = _apart(flight)
+    others = apart(flight)
     for axis, name in enumerate(("x (north)", "y (east)", "z (down)")):
         left, right = cells[axis]
-        for path in apart:
+        for path in others:
             left.plot(flight.time_s, path[:, axis], color=COMMAND, linestyle=":", label="truth, another module")
         left.plot(flight.time_s, believed[:, axis], color=ESTIMATE, linewidth=3.0, alpha=0.55, label="estimate")
         left.plot(flight.time_s, truth[:, axis], color=TRUTH, label="truth")
         left.plot(flight.time_s, wanted[:, axis], color=REFERENCE, linestyle="--", label="reference")
         left.set(ylabel=f"{name}, m")
-        doubt_mm, error_mm = 1e3 * (believed - truth)[:, axis], 1e3 * (truth - wanted)[:, axis]
+        doubt_mm, error_mm = 1e3 * (believed - truth)[:, axis], _once_steered(flight, 1e3 * (truth - wanted)[:, axis])
         right.plot(flight.time_s, doubt_mm, color=ESTIMATE, linewidth=0.9, label="estimate - truth")
         right.plot(flight.time_s, error_mm, color=TRUTH, label="truth - reference")
         right.axhline(0.0, color=REFERENCE, linewidth=0.8)
@@ -197,7 +157,7 @@ def attitude(flight: Flight, window: Window) -> Any:
     cells = figure.subplots(3, 1, sharex=True)
     wanted = flight.firmware["setpoint_q_wb"]
     truth, believed = (
-        _once_placed(flight, np.degrees(rotation_vectors(q_wb, wanted))) for q_wb in (flight.q_wb, flight.firmware["q_wb"])
+        _once_steered(flight, np.degrees(rotation_vectors(q_wb, wanted))) for q_wb in (flight.q_wb, flight.firmware["q_wb"])
     )
     for axis, name in enumerate(("roll x", "pitch y", "yaw z")):
         cells[axis].plot(flight.time_s, believed[:, axis], color=ESTIMATE, linewidth=0.9, label="estimate - reference")

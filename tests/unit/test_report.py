@@ -24,11 +24,10 @@ from hil.console import flight_progress, print_result
 from hil.flight import _scene, as_wanted, flown_of, wanted_in
 from hil.force_metrics import force_names
 from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, warning_lines
+from hil.plot_style import GREY, STYLE
 from hil.plots import (
-    GREY,
     JOINED,
     NOT_JUDGED,
-    STYLE,
     Window,
     _columns_of,
     attitude,
@@ -291,6 +290,35 @@ def test_plots_of_a_dock_say_whose_body_they_show(dock: Flight, tmp_path: Path, 
     write_plots(dock, tmp_path, Window(0.0, 2.0), TANK_M, np.array([-8.0, 10.0]), numbers=(3, 7))
     for name in ("position", "attitude", "estimate", "disturbance"):
         assert any(each.startswith(f"{name}: The body that module 3 leads") for each in said)
+
+
+def test_overview_draws_the_reference_over_the_truth_and_a_round_tank_round(flight: Flight) -> None:
+    figure = overview(flight, WINDOW, TANK_M, None, "cylinder")
+    axes = figure.axes[0]
+    labels = [line.get_label() for line in axes.lines]
+    assert not axes.computed_zorder and labels.index("reference") > labels.index("truth")
+    rim = np.array(axes.lines[0].get_data_3d())
+    np.testing.assert_allclose(np.hypot(rim[0], rim[1] - rim[1].mean()), 0.65, atol=0.01)
+    pyplot.close(figure)
+
+
+def test_overview_of_a_short_path_is_enlarged_to_it(flight: Flight) -> None:
+    figure = overview(flight, WINDOW, 20.0 * TANK_M, None)
+    axes = figure.axes[0]
+    assert axes.get_title() == "Path, enlarged: the tank is left out"
+    assert axes.get_xlim()[1] - axes.get_xlim()[0] < 1.0
+    pyplot.close(figure)
+
+
+def test_errors_are_not_drawn_while_the_reference_is_the_estimate(flight: Flight) -> None:
+    setpoint = flight.firmware["setpoint_p_wb"].copy()
+    setpoint[:100] = flight.firmware["p_wb"][:100]
+    early = dataclasses.replace(flight, firmware=flight.firmware | {"setpoint_p_wb": setpoint})
+    for draw, at in ((position, 1), (attitude, 0)):
+        figure = draw(early, WINDOW)
+        (line,) = (line for line in figure.axes[at].lines if line.get_label() == "truth - reference")
+        assert np.isfinite(line.get_ydata()).tolist() == [False] * 100 + [True] * (len(setpoint) - 100)
+        pyplot.close(figure)
 
 
 @pytest.mark.slow
