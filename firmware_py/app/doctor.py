@@ -83,7 +83,8 @@ def check_permissions() -> Iterator[Finding]:
     with real_time() as refused:
         pass
     if not refused:
-        yield Finding("real time", OK, f"priority, timers, small pages and locked memory are granted (rtprio {limit})")
+        by = f"rtprio {limit}" if limit > 0 else "by privilege, not by rtprio"
+        yield Finding("real time", OK, f"priority, timers, small pages and locked memory are granted ({by})")
     for line in refused:
         yield Finding(
             "real time", WARNING, line, "run it as modcube.service, or raise rtprio and memlock in limits.conf"

@@ -8,6 +8,7 @@ import shutil
 import socket
 import subprocess
 from collections.abc import Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -79,6 +80,14 @@ def test_interface_is_judged_by_what_ip_says_of_it(text: str, state: str, says: 
 def test_kernel_without_preempt_rt_is_warned_of_and_one_with_it_is_not() -> None:
     assert check_kernel(lambda path: "1").state == OK
     assert check_kernel(lambda path: "").state in (OK, WARNING)
+
+
+@pytest.mark.parametrize(("limit", "says"), [(0, "(by privilege, not by rtprio)"), (60, "(rtprio 60)")])
+def test_priority_that_is_granted_is_not_said_to_be_zero(limit: int, says: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor, "real_time", lambda: nullcontext([]))
+    monkeypatch.setattr("resource.getrlimit", lambda which: (limit, limit))
+    (finding,) = doctor.check_permissions()
+    assert finding.state == OK and finding.text.endswith(says)
 
 
 @pytest.mark.parametrize(
