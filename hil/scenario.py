@@ -215,8 +215,8 @@ class Scenario:
             for i, what in overlaps(cells, numbers):
                 raise DescriptionError(what, "module", members[i], "cell")
             if not is_connected(np.array(cells)):
-                what = f"modules {', '.join(map(str, numbers))} share a body, but their cells do not hang together"
-                raise DescriptionError(what, "module", members[0], "body")
+                what = f"modules {', '.join(map(str, numbers))} share a body, but their cells are not connected; give cells side by side"
+                raise DescriptionError(what, "module", members[0], "cell")
 
     @property
     def groups(self) -> list[tuple[int, ...]]:

@@ -149,7 +149,7 @@ def dask_cluster(address: str) -> Pool:
 def _dask_client(address: str) -> Any:
     found = re.fullmatch(r"t(?:cp|ls)://(.+):(\d+)", address)
     if not found:
-        raise DescriptionError(f"--dask {address!r} is no address; it needs tcp://HOST:PORT, as `dask scheduler` prints it")
+        raise DescriptionError(f"--dask {address!r} is not an address; it needs tcp://HOST:PORT, as `dask scheduler` prints it")
     try:
         socket.create_connection((found[1], int(found[2])), timeout=10).close()
         from distributed import Client

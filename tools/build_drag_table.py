@@ -201,7 +201,7 @@ def main(
     modes = list(METHODS) if compare else [mode]
     tables = {shape: {m: table_of(description, placed, m, store) for m in modes} for shape, placed in shapes.items()}
     if description.assumption:
-        console.print(f"assumed: {description.assumption}")
+        console.print(f"assumption: {description.assumption}")
     print_forces(console, tables)
     if compare:
         print_comparison(console, description, shapes, directions)

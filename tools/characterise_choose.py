@@ -66,7 +66,7 @@ def _show(console: Console, task: Task, count: int, found: Sequence[Choice], ass
         "margin: factor by which the whole task can be multiplied; below 1 the shape cannot do it", highlight=False
     )
     if assumption:
-        console.print(f"assumed: {assumption}", markup=False, highlight=False)
+        console.print(f"assumption: {assumption}", markup=False, highlight=False)
 
 
 def _row(place: int, choice: Choice) -> dict[str, Any]:

@@ -68,7 +68,7 @@ LABELS = {
     "rank": ("rank of the actuation matrix", ""),
     "passive": ("passive axes", ""),
     "assumption": ("assumption", ""),
-    "program_facet_difference": ("linear programs against facets, largest relative difference", ""),
+    "program_facet_difference": ("self-check: largest relative difference of two methods", ""),
     "price_usd": ("price", "USD"),
     "depth_m": ("depth rating", "m"),
     "size_cm": ("size", "cm"),

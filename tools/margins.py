@@ -97,7 +97,7 @@ def print_table(table_rows: Sequence[dict[str, Any]]) -> None:
             ", ".join(f"{v:g}" for v in worst["at"]), verdict,
         )  # fmt: skip
     bars = [f"{kind} >= {gain:g} dB and {phase:g} deg" for kind, (gain, phase) in BARS.items()]
-    table.caption = "bars: " + "; ".join(bars)
+    table.caption = "limits: " + "; ".join(bars)
     Console(width=None if sys.stdout.isatty() else 130).print(table)
 
 

@@ -91,7 +91,7 @@ def tune_live(objective: Objective, live: str, steps: int, seconds: float, out: 
     """Tunes the vehicle at mavlink:ADDRESS, with typed answers; returns the exit status as `tune` does. Raises DescriptionError."""
     scheme, _, address = live.partition(":")
     if scheme != "mavlink" or not address:
-        raise DescriptionError(f"--live {live!r} is no address; it needs mavlink:ADDRESS, such as mavlink:udpin:127.0.0.1:14550")
+        raise DescriptionError(f"--live {live!r} is not an address; it needs mavlink:ADDRESS, such as mavlink:udpin:127.0.0.1:14550")
     for number in ENDINGS:
         signal.signal(number, _end)
     with closing(connect(address)) as link, open(0, "rb", buffering=0, closefd=False) as stdin:

@@ -78,7 +78,7 @@ class Inertial:
         least, middle, most = np.linalg.eigvalsh(self.inertia)
         if not np.array_equal(self.inertia, self.inertia.T) or least <= 0.0 or most > (least + middle) * (1.0 + 1e-9):
             raise DescriptionError(
-                f"inertia {self.inertia.tolist()} is none that a body can have: "
+                f"inertia {self.inertia.tolist()} is not physical: "
                 "it must be symmetric and positive, no principal moment above the sum of the others",
                 "inertia",
             )

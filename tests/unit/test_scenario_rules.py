@@ -130,7 +130,7 @@ def load(tmp_path: Path) -> Load:
         ("hover", "settle_s = 15.0", "settle_s = 1.0", "1 s; the robot is armed after 1 s, and the task needs it armed; 1.1"),
         ("faults", "settle_s = 3.0", "settle_s = 0.0", "task.settle_s: 0 s; the robot is armed after 1 s"),
         ("mobius-4", "cell = [1, 1, 0]", "cell = [1, 0, 0]", ":35: modules 2 and 4 overlap in cell (1, 0, 0)"),
-        ("mobius-2", "cell = [1, 0, 0]", "cell = [1, 1, 0]", ":16: modules 1, 2 share a body, but their cells do not hang together"),
+        ("mobius-2", "cell = [1, 0, 0]", "cell = [1, 1, 0]", "modules 1, 2 share a body, but their cells are not connected; give"),
         ("hover", "", '[[step]]\ndo = "wait"', "step[0]: a task of the kind hover runs no steps"),
         ("hover", 'kind = "hover"', 'kind = "hover"\nfile = "none.csv"', "task.file: a task of the kind hover flies no file"),
         ("waypoints", 'file = "waypoints.csv"', "", "task.kind: waypoints flies a file, and there is none"),

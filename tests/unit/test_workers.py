@@ -156,7 +156,7 @@ def test_workers_that_are_kept_serve_every_campaign_until_one_dies(tmp_path: Pat
 
 @pytest.mark.parametrize(
     ("address", "words"), [
-        ("nonsense", "is no address; it needs tcp://HOST:PORT"),
+        ("nonsense", "is not an address; it needs tcp://HOST:PORT"),
         ("tcp://127.0.0.1:1", "no dask scheduler at tcp"),
         (f"tcp://{64 * 'a'}:1", "no dask scheduler at tcp"),
     ],

@@ -184,7 +184,7 @@ def _notes(layout: Layout) -> tuple[str, ...]:
         lost = f", cannot push {', '.join(left)} alone" if left else ""
         notes.append(f"degenerate: rank {layout.rank}{lost}; passive: {held}")
     if layout.assumption:
-        notes.append(f"assumed: {layout.assumption}")
+        notes.append(f"assumption: {layout.assumption}")
     return tuple(notes)
 
 
