@@ -90,7 +90,8 @@ def counts_in(row: Row) -> str:
     if len(row.modes) > len(Mode) // 2:
         return "all but " + ", ".join(sorted(m.name for m in ANY - row.modes))
     forced = [f"{m.name} (by a fail-safe)" for m in sorted(row.forced_modes)]
-    return ", ".join([*sorted(m.name for m in row.modes), *forced])
+    warned = [f"{m.name} (only warns)" for m in sorted(row.warned_modes)]
+    return ", ".join([*sorted(m.name for m in row.modes), *forced, *warned])
 
 
 def failsafes() -> list[str]:

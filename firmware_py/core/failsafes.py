@@ -36,6 +36,8 @@ PLACED = frozenset(row.mode for row in MODE_TABLE if Need.POSITION in row.needs)
 MOVING = PLACED - {Mode.POSHOLD}
 FREE = PLACED - {Mode.DOCK}
 """Position modes in which nothing but the water should push the body."""
+TRUSTING = frozenset({Mode.ALT_HOLD, Mode.STABILIZE})
+"""Modes that hold depth or attitude by the estimate for a pilot: if it contradicts the tags, he is told, and keeps control."""
 PILOTED = frozenset(row.mode for row in MODE_TABLE if row.by_pilot)
 
 PERMITTED = {
@@ -62,6 +64,8 @@ class Row(NamedTuple):
     modes: frozenset[Mode] = ANY
     forced_modes: frozenset[Mode] = frozenset()
     """Further modes, in which it counts only if a fail-safe and not a person chose them."""
+    warned_modes: frozenset[Mode] = frozenset()
+    """Further modes, in which it only warns, whatever its action."""
 
 
 TABLE = (
@@ -76,8 +80,8 @@ TABLE = (
     Row("depth_unknown", "depth unknown for {:.1f} s", "depth_unknown_s", modes=PLACED | {Mode.ALT_HOLD}),
     Row("tag_gone", "no tag for {:.1f} s", "tag_age_s", modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
     Row("partner_lost", "a docked partner is lost", "partner_lost"),
-    Row("estimator", "sensors and model disagree: {:.1f} of the expected", "nis_ratio", modes=PLACED),
-    Row("rejected", "{:.0%} of the tags refused", "rejected_share", modes=PLACED),
+    Row("estimator", "sensors and model disagree: {:.1f} of the expected", "nis_ratio", modes=PLACED, warned_modes=TRUSTING),
+    Row("rejected", "{:.0%} of the tags refused", "rejected_share", modes=PLACED, warned_modes=TRUSTING),
     Row("tag_lost", "no tag for {:.1f} s", "tag_age_s", modes=PLACED),
     Row("pushed", "pushed out of sight as by a current of {:.1f} m/s", "unseen_push_m_s", modes=FREE),
     Row("tag_late", "no tag for {:.1f} s", "tag_age_s", modes=MOVING),
@@ -118,6 +122,8 @@ class Watch:
         self._told_ns: int | None = None
         """`_since_ns` at the last report. A cause that went and came back has a new `_since_ns`, and is reported again."""
         self.active, self.level = False, Level.NONE
+        self.acts_as = Level.NONE
+        """Its action in the present mode, kept up while it is active or its cause lasts."""
         self.began = ""
         """Its text when it last began."""
         self.retune(parameters)
@@ -129,6 +135,7 @@ class Watch:
         self.level = Level(getattr(parameters, f"{name}_action"))
         self.latched = bool(getattr(parameters, f"{name}_latched"))
         self._told_ns = self._told_ns if self.level == before else None
+        self.acts_as = self.level if self.level != before else self.acts_as
         self.active = self.active and self.level != Level.NONE  # NONE is not watched; it begins afresh when watched again
         self._delay_ns = round(getattr(parameters, f"{name}_delay_s") * 1e9)
         self._clear_ns = round(parameters.clear_s * 1e9)
@@ -137,6 +144,7 @@ class Watch:
         """Inherits from the watches of the same row in the bodies before: active if any was, with the age of the oldest cause."""
         on = [watch for watch in before if watch.active]
         self.active, self.began = bool(on), next((watch.began for watch in on), "")
+        self.acts_as = max((watch.acts_as for watch in on), default=self.level)
         self._since_ns = min((watch._since_ns for watch in before if watch._since_ns is not None), default=None)
         self._told_ns = self._since_ns if on and all(watch._told_ns == watch._since_ns for watch in on) else None
 
@@ -151,7 +159,14 @@ class Watch:
             return False
         if not armed:
             return self.row.modes == ANY
-        return mode in self.row.modes or (forced and mode in self.row.forced_modes)
+        return mode in self.row.modes or mode in self.row.warned_modes or (forced and mode in self.row.forced_modes)
+
+    def enter(self, mode: Mode) -> None:
+        """Sets its action in `mode`. Where it only warned before and now acts, its delay counts anew."""
+        level = min(self.level, Level.WARN) if mode in self.row.warned_modes else self.level
+        if level > self.acts_as:
+            self._since_ns = None
+        self.acts_as = level
 
     def words(self, health: Health) -> str:
         """Returns its text with the present value."""
@@ -214,17 +229,18 @@ class Failsafes:
             if not cause and not watch.active and watch._since_ns is None:
                 continue
             was_active = watch.active
+            watch.enter(mode)
             if watch.step(health.time_ns, cause, armed):
                 again = was_active and watch.active
                 words = watch.words(health) if watch.active else watch.ending(health, mode, armed)
-                alarms.append(Alarm(watch.row.name, words, watch.level, watch.active, again))
+                alarms.append(Alarm(watch.row.name, words, watch.acts_as, watch.active, again))
                 watch.began = words if watch.active else watch.began
         return alarms
 
     @property
     def level(self) -> Level:
         """Strongest action of all active fail-safes."""
-        return max((watch.level for watch in self._all if watch.active), default=Level.NONE)
+        return max((watch.acts_as for watch in self._all if watch.active), default=Level.NONE)
 
     def is_on(self, name: str) -> bool:
         """Whether the row of that name is active."""
@@ -232,7 +248,7 @@ class Failsafes:
 
     def active(self, health: Health) -> list[str]:
         """Returns the active fail-safes above a warning, in words."""
-        return [watch.reason(health) for watch in self._all if watch.active and watch.level > Level.WARN]
+        return [watch.reason(health) for watch in self._all if watch.active and watch.acts_as > Level.WARN]
 
     def reasons_against(self, mode: Mode, health: Health, but: Container[str] = ()) -> list[str]:
         """Returns the reasons against entering `mode` now, in words; empty when it may be entered. Rows named in `but` are ignored."""

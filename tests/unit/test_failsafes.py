@@ -76,8 +76,8 @@ def test_push_counts_only_while_no_tag_tells_what_it_does() -> None:
 COUNTS = {
     "depth_unknown": POSE_MODES | {Mode.ALT_HOLD},
     "tag_gone": POSE_MODES,
-    "estimator": POSE_MODES,
-    "rejected": POSE_MODES,
+    "estimator": POSE_MODES | {Mode.ALT_HOLD, Mode.STABILIZE},
+    "rejected": POSE_MODES | {Mode.ALT_HOLD, Mode.STABILIZE},
     "tag_lost": POSE_MODES,
     "pushed": POSE_MODES - {Mode.DOCK},
     "tag_late": POSE_MODES - {Mode.POSHOLD},
@@ -98,6 +98,16 @@ def test_fail_safe_counts_in_its_modes_alone(name: str, mode: Mode) -> None:
 def test_mode_that_a_fail_safe_chose_is_left_when_tags_do_not_come_back(name: str, mode: Mode) -> None:
     expected = mode in COUNTS.get(name, set(Mode)) or (name == "tag_gone" and mode == Mode.ALT_HOLD)
     assert bool(alarms_of(quick(name), bad(name), mode, forced=True)) == expected
+
+
+@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("mode", Mode, ids=lambda mode: mode.name)
+def test_pilot_who_flies_by_the_estimate_is_only_told_that_it_contradicts_the_tags(name: str, mode: Mode) -> None:
+    only_warns = name in ("estimator", "rejected") and mode in (Mode.ALT_HOLD, Mode.STABILIZE)
+    for action in Level:
+        wanted = replace(quick(name), **{f"{name}_action": int(action)})
+        for alarm in alarms_of(wanted, bad(name), mode):
+            assert alarm.level == (min(action, Level.WARN) if only_warns else action)
 
 
 @pytest.mark.parametrize("name", FIELDS)

@@ -288,3 +288,31 @@ def test_depth_hold_of_a_fail_safe_that_a_pilot_takes_is_his() -> None:
     ask(supervisor, Action.SET_MODE, Mode.ALT_HOLD, at(GOOD._replace(tag_age_s=10.0), 1))
     assert supervisor.level == Level.NONE
     assert supervisor.step(False, at(GOOD._replace(tag_age_s=40.0), 31), []) == []
+
+
+@pytest.mark.parametrize("mode", [Mode.ALT_HOLD, Mode.STABILIZE])
+def test_pilot_keeps_control_of_a_robot_that_refuses_its_tags_but_it_holds_no_place_then(mode: Mode) -> None:
+    supervisor, bad = supervisor_in(mode=mode), GOOD._replace(rejected_share=0.99)
+    said = []
+    for tick in range(500):
+        supervisor.step(False, bad._replace(time_ns=GOOD.time_ns + 10_000_000 * tick), [])
+        said += texts(supervisor)
+    assert said == ["fail-safe on: 99% of the tags refused"]
+    assert supervisor.mode == mode and supervisor.level == Level.NONE and not supervisor.events
+    ask(supervisor, Action.SET_MODE, Mode.POSHOLD, bad._replace(time_ns=GOOD.time_ns + 5_000_000_000))
+    assert supervisor.mode == mode, "refused while the cause lasts"
+
+
+def test_warning_to_a_pilot_becomes_an_action_when_another_fail_safe_takes_the_mode_from_him() -> None:
+    """The pilot falls silent after four seconds; the robot holds its place by tags that it refuses for no longer than the delay."""
+    supervisor, bad = supervisor_in(mode=Mode.ALT_HOLD), GOOD._replace(rejected_share=0.99)
+    modes = []
+    for tick in range(800):
+        silence_s = 0.01 * max(tick - 300, 0)
+        health = bad._replace(time_ns=GOOD.time_ns + 10_000_000 * tick, pilot_age_s=silence_s)
+        supervisor.step(False, health, [])
+        modes.append(supervisor.mode)
+    held = modes.count(Mode.POSHOLD)
+    assert modes[400] == Mode.ALT_HOLD and modes[402] == Mode.POSHOLD and modes[-1] == Mode.ALT_HOLD
+    assert 200 <= held <= 202, "the delay of two seconds"
+    assert supervisor.level == Level.DEPTH
