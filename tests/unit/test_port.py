@@ -1,9 +1,11 @@
 """One suite for every kind of bus (tests/vcan runs it on real SocketCAN), and invalid addresses."""
 
+import contextlib
 import functools
 import os
 import subprocess
 import sys
+import threading
 from typing import Any
 
 import can
@@ -93,6 +95,25 @@ class TestSlcan(PortSuite):
         assert receive(other, 1) == [FRAMES[1]]
         one.close()
         assert run().returncode == 0
+
+    def test_adapter_that_accepts_nothing_any_more_is_closed_at_once(self, cable):
+        """Regression: python-can waited for it without end, in the loop that flies the robot."""
+        link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))
+        bus: Any = link.open()
+        cable.stop()
+        with pytest.raises(BlockingIOError):
+            while True:
+                os.write(bus.fileno(), b"x" * 1024)
+
+        def close() -> None:
+            with contextlib.suppress(OSError):
+                link.close(bus)
+
+        closing = threading.Thread(target=close, daemon=True)
+        closing.start()
+        closing.join(10.0)
+        assert not closing.is_alive()
+        assert not bus.serialPortOrig.is_open
 
     def test_adapter_whose_device_fails_to_close_can_be_opened_again(self, cable, monkeypatch):
         link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))

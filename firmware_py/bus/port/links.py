@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import ipaddress
@@ -277,14 +278,19 @@ class SlcanLink(Link):
             self._lock = None
 
     def close(self, bus: Any) -> None:
-        """Closes the bus, and its device too: python-can leaves that open when the device is gone and its last command fails."""
+        """Switches the channel off, as far as the device accepts that at once, and closes bus and device.
+
+        python-can waits without end for a device that accepts nothing, so the device is closed before python-can could write to it.
+        """
         try:
-            bus.shutdown()
+            os.write(bus.fileno(), self._rest + b"C\r")
         finally:
             try:
                 bus.serialPortOrig.close()
             finally:
                 self._give_back()
+                with contextlib.suppress(can.CanError):
+                    bus.shutdown()
 
     def send(self, bus: Any, frame: Frame) -> None:
         """Writes what the device accepts at once.
