@@ -30,9 +30,6 @@ from firmware_py.core.topology import Motion, down_of
 from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, ExpectedDepth, Measured
 from firmware_py.description.parameters import Estimation
 
-TAG_FRESH_NS = 1_000_000_000
-"""Age up to which a tag tells the depth: until then gyro and accelerometer carry it on to a few centimetres. The fail-safe `tag_late`
-takes as long."""
 READY_AFTER = 10
 """Tag observations to accept before the pose counts as valid."""
 UNKNOWN_SIGMA = np.full(6, 1e3)
@@ -123,8 +120,11 @@ class Estimator:
         return np.asarray(self._now[3:7])
 
     def expected_depth(self, time_ns: int) -> ExpectedDepth | None:
-        """Returns what the body's depth sensors are to tell at `time_ns`; None unless tags tell the depth."""
-        if self._accepted < READY_AFTER or time_ns - self._last_tag_ns > TAG_FRESH_NS:
+        """Returns what the body's depth sensors are to tell at `time_ns`; None unless tags tell the depth.
+
+        Without tags a push carries the body away from the estimate within half a second, and the depth sensors are right.
+        """
+        if self._accepted < READY_AFTER or time_ns - self._last_tag_ns > BLIND_NS:
             return None
         sigma_m = math.sqrt(self._depth_variance + self._head.covariance[24, 24] + self._p.depth_sigma_m**2)
         return ExpectedDepth(float(self._now[2] + self._now[25]), sigma_m, to_matrix(self.q_wb)[2].tolist())
