@@ -46,8 +46,7 @@ class Script(Orders):
         start = scenario.module[0].start
         self.trajectory = TASKS[scenario.task.kind](scenario.task, rest_at(start.p_wm, start.q_wm), fleet)
         try:
-            refuse_outside(self.trajectory, scenario)
-            refuse_in_wall(self.trajectory, scenario)
+            refuse_beyond_tank(self.trajectory, scenario)
         except DescriptionError as error:
             raise DescriptionError(f"{scenario.task.file or f'{scenario.name}: task'}: {error}") from None
         self.ticks = scenario.task.end_ns // fleet.period_ns
@@ -82,8 +81,7 @@ def mistake_of_flight(scenario: Scenario, fleet: Fleet) -> tuple[tuple[str | int
     start = scenario.module[0].start
     path = TASKS[scenario.task.kind](scenario.task, rest_at(start.p_wm, start.q_wm), fleet)
     try:
-        refuse_outside(path, scenario)
-        refuse_in_wall(path, scenario)
+        refuse_beyond_tank(path, scenario)
     except DescriptionError as error:
         return ("task",), str(error)
     return None
@@ -96,6 +94,12 @@ def refuse_points_outside(scenario: Scenario) -> None:
         if not scenario.tank.holds(waypoint.position_m):
             where = f"{task.file}:{line_of(task.file_text, task.file, k)}: waypoint {k}, at {waypoint.position_m.tolist()} m"
             raise DescriptionError(f"{where}, is outside the tank, a {scenario.tank}; keep it inside")
+
+
+def refuse_beyond_tank(path: Trajectory, scenario: Scenario) -> None:
+    """Raises DescriptionError if the path takes the body's centre out of the tank, or one of its hulls into a wall."""
+    refuse_outside(path, scenario)
+    refuse_in_wall(path, scenario)
 
 
 def refuse_outside(path: Trajectory, scenario: Scenario) -> None:

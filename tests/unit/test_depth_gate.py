@@ -10,11 +10,14 @@ from firmware_py.core.measurements import ATMOSPHERE_PA
 from firmware_py.core.types import ExpectedDepth, Mode, ModuleInputs
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
+from tests.unit.estimated_robot import P_WB, PERIOD, Robot, sensors
 from tests.unit.tanks import Tank, flies_with_noise, single
 
 PAIR = assemble([(0, 0, 0), (0, 0, 1)], [0, 0], [load_vehicle("modcube")] * 2)
 """Two modules, one above the other."""
 LEVEL = (0.0, 0.0, 1.0)
+DEPTH_HZ = 50.0
+"""Rate of the DEPTH frames."""
 AT_3_M = ExpectedDepth(3.0, 0.003, LEVEL)
 
 
@@ -74,6 +77,19 @@ def test_sensor_that_errs_by_metres_is_not_believed_with_tags_nor_without_until_
     assert told(gate, [8.0, 3.0, 3.0], None) == [None] * 3, "no tag bears it out"
     assert told(gate, [3.0] * (DOUBT + 1)) == [None] * (DOUBT - 1) + [3.0] * 2
     assert told(gate, [2.0], None) == [2.0]
+
+
+def test_tags_alone_convict_a_sensor_not_the_memory_of_them() -> None:
+    """Regression: a robot that was pushed hard when the tags went distrusted its good depth sensor, and surfaced."""
+    robot = Robot(single())
+    robot.rest(101)
+    expected = robot.estimator.expected_depth(robot.time_ns)
+    assert expected is not None and expected.depth_m == pytest.approx(P_WB[2], abs=2e-3) and expected.sigma_m < 0.1
+    remembered = 0
+    while robot.estimator.expected_depth(robot.time_ns) is not None:
+        robot.step(sensors())
+        remembered += 1
+    assert 0.1 < remembered * PERIOD * 1e-9 <= 0.5 * DOUBT / DEPTH_HZ + 0.04, "and the age of the last picture"
 
 
 def test_few_false_readings_do_not_make_a_sensor_distrusted() -> None:

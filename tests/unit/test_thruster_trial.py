@@ -22,6 +22,15 @@ def as_if_lost(thruster: int) -> np.ndarray:
     return -1.5 * np.sign(PUSH[thruster]) * BODY.thrusters.matrix[:, thruster]
 
 
+def on_trial(thruster: int, since_s: float) -> Water:
+    """A robot that something pushes, and whose innocent thruster was left out for that; `since_s` after the push began."""
+    water = Water(seed=thruster)
+    water.fly()
+    water.pushed = as_if_lost(thruster)
+    assert [words for _, words in water.run(since_s, WANTED)] == [f"thruster {thruster + 1} {LEFT_OUT}"]
+    return water
+
+
 @pytest.mark.parametrize("thruster", range(8))
 def test_thruster_is_used_again_when_the_robot_is_pushed_as_much_without_it(thruster: int) -> None:
     water = Water(seed=thruster)
@@ -63,10 +72,7 @@ def test_thruster_is_acquitted_twice_and_no_more_until_the_robot_is_armed_again(
 
 def test_thruster_stays_left_out_when_tags_are_lost_for_the_rest_of_its_trial() -> None:
     """Without tags the motion says too little to acquit anybody."""
-    water = Water(seed=3)
-    water.fly()
-    water.pushed = as_if_lost(3)
-    assert [words for _, words in water.run(1.0, WANTED)] == [f"thruster 4 {LEFT_OUT}"]
+    water = on_trial(3, 1.0)
     water.tag_age_ns = 600_000_000
     assert water.run(2.5, WANTED) == []
     water.tag_age_ns = 0
@@ -75,10 +81,7 @@ def test_thruster_stays_left_out_when_tags_are_lost_for_the_rest_of_its_trial() 
 
 
 def test_verdict_comes_although_a_block_of_the_trial_could_not_be_measured() -> None:
-    water = Water(seed=1)
-    water.fly()
-    water.pushed = as_if_lost(1)
-    assert [words for _, words in water.run(1.2, WANTED)] == [f"thruster 2 {LEFT_OUT}"]
+    water = on_trial(1, 1.2)
     water.heard = 0.0
     water.run(0.08, WANTED)
     water.heard = 1.0
