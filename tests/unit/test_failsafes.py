@@ -337,6 +337,35 @@ def test_other_action_is_acted_on_anew_and_one_that_is_switched_off_is_over() ->
     assert failsafes.level == Level.NONE and not failsafes.is_on("cabin_hot")
 
 
+def test_graver_action_is_carried_out_at_once_by_a_fail_safe_that_is_on() -> None:
+    hot, delayed = GOOD._replace(cabin_c=80.0), replace(quick("cabin_hot"), cabin_hot_delay_s=1.0)
+    failsafes = Failsafes(replace(delayed, cabin_hot_action=int(Level.WARN)))
+    for seconds in (0.0, 1.0):
+        failsafes.step(at(hot, seconds), Mode.AUTO, False, True)
+    failsafes.retune(delayed)
+    assert [alarm.level for alarm in failsafes.step(at(hot, 1.1), Mode.AUTO, False, True)] == [Level.SURFACE]
+
+
+def warned_in_alt_hold() -> Failsafes:
+    """Fail-safe `estimator`, delay 1 s, on since one second in ALT_HOLD, where it only warns."""
+    failsafes = Failsafes(replace(quick("estimator"), estimator_delay_s=1.0))
+    for seconds in (0.0, 1.0):
+        failsafes.step(at(bad("estimator"), seconds), Mode.ALT_HOLD, False, True)
+    assert failsafes.is_on("estimator") and failsafes.level == Level.WARN
+    return failsafes
+
+
+def test_fail_safe_that_only_warned_waits_its_delay_in_a_mode_where_it_acts() -> None:
+    after = Failsafes(replace(quick("estimator"), estimator_delay_s=1.0))
+    after.take_over([warned_in_alt_hold()])
+    assert after.level == Level.WARN, "a body that takes over starts from the action in the mode before"
+    for failsafes in (warned_in_alt_hold(), after):
+        assert failsafes.step(at(bad("estimator"), 1.1), Mode.POSHOLD, False, True) == []
+        assert failsafes.step(at(bad("estimator"), 2.0), Mode.POSHOLD, False, True) == []
+        (alarm,) = failsafes.step(at(bad("estimator"), 2.1), Mode.POSHOLD, False, True)
+        assert alarm.level == Level(P.estimator_action) > Level.WARN
+
+
 def test_body_that_takes_over_goes_on_with_every_fail_safe_and_its_time() -> None:
     leaky, weak, after = (Failsafes(P) for _ in range(3))
     wet, low = GOOD._replace(leak=True), GOOD._replace(voltage_share=0.79)
