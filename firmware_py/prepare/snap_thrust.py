@@ -52,17 +52,16 @@ def wrenches(body: Body, motion: np.ndarray) -> np.ndarray:
         body: masses, drag, righting moment.
         motion: (k, 19) p_wb, q_wb, v_w, w_b, a_w, alpha_b.
     """
-    out = np.empty((len(motion), 6))
+    out, nu, change = (np.empty((len(motion), 6)) for _ in range(3))
+    for row, velocity, turned in zip(np.ascontiguousarray(motion), nu, change, strict=True):
+        velocity[:3], velocity[3:] = rotations.rotate_back(row[3:7], row[7:10]), row[10:13]
+        turned[:3], turned[3:] = rotations.rotate_back(row[3:7], row[13:16]), row[16:19]
+    change[:, :3] -= np.cross(nu[:, 3:], nu[:, :3])
     drag = body.drag
     for k, row in enumerate(np.ascontiguousarray(motion)):
-        q, w = row[3:7], row[10:13]
-        nu, change = np.empty(6), np.empty(6)
-        nu[:3], nu[3:] = rotations.rotate_back(q, row[7:10]), w
-        change[:3] = rotations.rotate_back(q, row[13:16]) - np.cross(w, nu[:3])
-        change[3:] = row[16:19]
-        out[k] = body.mass @ change + coriolis_wrench(body.mass, nu)
-        out[k] -= drag_wrench(drag.nodes, drag.rotational, drag.linear, nu)
-        out[k, 3:] -= restoring_moment(body.righting, q)
+        out[k] = body.mass @ change[k] + coriolis_wrench(body.mass, nu[k])
+        out[k] -= drag_wrench(drag.nodes, drag.rotational, drag.linear, nu[k])
+        out[k, 3:] -= restoring_moment(body.righting, row[3:7])
     return out
 
 
