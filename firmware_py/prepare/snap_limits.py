@@ -35,7 +35,11 @@ _SOLVER = {
     "polishing": True,
     "verbose": False,
     "adaptive_rho_interval": 50,  # counted, not timed: the same result every time
+    "scaling": 0,  # _Problem scales; OSQP's own scaling leaves its rho at a bound where durations are uneven
+    "eps_dual_inf": 1e-15,  # snap is bounded below: a certificate of the opposite is false
 }
+_CURVATURE = 1e-3
+"""Curvature of the scaled cost. With 1, and rows of 0.02 as velocities have, OSQP's rho reaches its upper bound of 1e6."""
 _CORRIDOR_SIDES = 8
 """Number of sides of the prism, inside the cylinder, that represents a corridor."""
 
@@ -135,12 +139,12 @@ class _Table:
 
     def excess(self, coefficients: np.ndarray, durations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(m,) largest |normal . derivative - centre| over bound on each piece, and (m,) the share of the piece at which it is."""
-        grid = np.linspace(0.0, 1.0, _CHECK_POINTS + 1)
+        grid = _towards_ends(np.arange(_CHECK_POINTS + 1) / _CHECK_POINTS)
         rows = np.stack([derivative_rows(grid, order) for order in range(3)])[self.order]
         sampled = self._used(rows, coefficients, durations)
         heights, places = crests(sampled)
         each = np.arange(len(sampled))
-        u = places[each, heights.argmax(axis=1)] / _CHECK_POINTS
+        u = _towards_ends(places[each, heights.argmax(axis=1)] / _CHECK_POINTS)
         rows = np.stack([derivative_rows(u, order) for order in range(3)])[self.order, each]
         crest, at_points = self._used(rows[:, None], coefficients, durations)[:, 0], sampled.max(axis=1)
         return np.maximum(crest, at_points), np.where(crest > at_points, u, grid[sampled.argmax(axis=1)])
@@ -150,6 +154,11 @@ class _Table:
         values = np.einsum("muj,mjc,mc->mu", rows, coefficients[self.piece], self.normal)
         values /= durations[self.piece][:, None] ** self.order[:, None]
         return np.asarray(np.abs(values - self.centre[:, None]) / self.bound[:, None])
+
+
+def _towards_ends(share: np.ndarray) -> np.ndarray:
+    """Shares of a piece, denser near its ends as Chebyshev's points are: there a polynomial may turn most sharply."""
+    return 0.5 - 0.5 * np.cos(math.pi * share)
 
 
 def crests(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -195,7 +204,7 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
     table = _Table.of(limits)
     problem = _Problem(system, knots, start)
     index = np.repeat(np.arange(len(limits)), _FIRST_POINTS)
-    where = np.tile(np.arange(_FIRST_POINTS) / _FIRST_POINTS, len(limits))
+    where = np.tile(_towards_ends(np.arange(_FIRST_POINTS) / _FIRST_POINTS), len(limits))
     for _ in range(_ROUNDS):
         try:
             unknown, conflict = problem.solve(table, index, where)
@@ -222,7 +231,7 @@ class _GaveUpError(Exception):
 
 
 class _Problem:
-    """The quadratic program in the free scaled derivatives of all three axes, each scaled to unit curvature."""
+    """The quadratic program in the free scaled derivatives of all three axes, each scaled to the same curvature."""
 
     def __init__(self, system: System, knots: Knots, start: np.ndarray) -> None:
         self._system, self._knots, self._count = system, knots, 3 * knots.fixed.size
@@ -235,8 +244,8 @@ class _Problem:
         reduced = form[self._free][:, self._free]
         self._scale = 1.0 / np.sqrt(reduced.diagonal())
         scaling = sparse.diags(self._scale)
-        self._form = sparse.triu(scaling @ reduced @ scaling, format="csc")
-        self._linear = self._scale * self._flat(system.gradient(knots.value, self._given))[self._free]
+        self._form = _CURVATURE * sparse.triu(scaling @ reduced @ scaling, format="csc")
+        self._linear = _CURVATURE * self._scale * self._flat(system.gradient(knots.value, self._given))[self._free]
         self._warm = self._flat(start)[self._free] / self._scale
 
     @staticmethod

@@ -144,6 +144,18 @@ def test_path_that_stops_at_every_waypoint_says_which_limit_it_cannot_keep() -> 
         plan(STOPS, 4.0, Limits(velocity=np.full(3, 0.4), corridor_m=0.1), stretch=False)
 
 
+@pytest.mark.parametrize("seed", [3, 9, 11, 17, 19])
+def test_pieces_whose_durations_differ_by_up_to_64_times_keep_their_velocity_without_more_time(seed: int) -> None:
+    """They took 1.6 to 55 times as long as asked, and went up to 1.4 % over a velocity near the ends of long pieces."""
+    rng = np.random.default_rng(seed)
+    times = rng.choice([0.5, 1.0, 8.0, 16.0, 32.0], size=6)
+    points = np.vstack([np.zeros(3), np.cumsum(rng.uniform(-0.1, 0.1, (6, 3)) * times[:, None], axis=0)])
+    found = plan([Waypoint(p) for p in points], list(times), Limits(velocity=np.full(3, 0.15)))
+    assert (found.method, found.stretch) == ("osqp", 1.0)
+    speeds = [np.abs(found.sample(float(t)).v_w).max() for t in np.linspace(0.0, found.duration_s, 10_001)]
+    assert 0.14 < max(speeds) < 0.1502
+
+
 @pytest.mark.parametrize("times", [None, 4.0, [1.0, 2.0]])
 def test_path_that_stops_at_every_waypoint_takes_the_time_that_its_limit_asks(times: object) -> None:
     found = plan(STOPS, times, Limits(velocity=np.full(3, 0.4)))  # type: ignore[arg-type]
