@@ -19,7 +19,7 @@ from hil.nodes import Mcu, Nodes
 from hil.plant.camera import Sighting
 from hil.plant.docking import RELAY
 from hil.plant.draw import stream
-from hil.plant.fault_spec import ALL, DIRECTIONS, FACES, FRAME_KINDS, THRUSTER_KINDS, Fault
+from hil.plant.fault_spec import ALL, DIRECTIONS, FACES, FRAME_KINDS, NS, THRUSTER_KINDS, Fault
 
 NUMBER = 0x1F
 """Mask of the module number in a CAN id."""
@@ -103,6 +103,10 @@ class Faults:
         self._breaks: dict[str, Callable[[Fault, Mcu], None]] = {
             **dict.fromkeys(THRUSTER_KINDS, self._break_thrusters),
             "imu_frozen": lambda fault, mcu: setattr(mcu, "frozen", True),
+            "pressure_jump": lambda fault, mcu: mcu.depth.err(fault.value, 0.0, 0),
+            "pressure_drift": lambda fault, mcu: mcu.depth.err(0.0, fault.value, round(fault.at_s * NS)),
+            "pressure_frozen": lambda fault, mcu: setattr(mcu.depth, "frozen", True),
+            "pressure_absent": lambda fault, mcu: setattr(mcu.depth, "absent", True),
             "leak": lambda fault, mcu: setattr(mcu, "leaks", True),
             "readings_absent": lambda fault, mcu: setattr(mcu, "readings_absent", True),
             "battery_sag": lambda fault, mcu: self._world.sag(mcu.module, fault.value),
@@ -180,11 +184,12 @@ class Faults:
     def _break_plant(self) -> None:
         """Applies the active faults from scratch, independent of history: repairs everything, then applies each fault.
 
-        Of two faults on the same part the later in the list wins; sags and pushes add up.
+        Of two faults on the same part the later in the list wins; sags, pushes and errors of a pressure add up.
         """
         self._world.jet_strength = self._world.spec.jet_strength
         for number, mcu in self._nodes.mcus.items():
             mcu.frozen = mcu.leaks = mcu.readings_absent = False
+            mcu.depth.repair()
             self._world.clear_faults(mcu.module)
             for fault in self._on:
                 if fault.kind in self._breaks and fault.module in (0, number):

@@ -55,6 +55,7 @@ class Mcu:
         self.errors = 0
         self._world, self._spec = world, spec
         self._sensors = Sensors(spec, world.spec, world.seed, module)
+        self.depth = self._sensors.depth
         self._thrusters = len(world.vehicles[module].thruster)
         self._command = [0.0] * 8
         self._armed = [False, False]
@@ -131,7 +132,7 @@ class Mcu:
             accel.encode(self.number, [*self._motion[1], 0], tick),
         ]
         for message, every, phase in self._slow:
-            if tick % every == phase and not (self.readings_absent and message.name in ("POWER", "ENVIRONMENT")):
+            if tick % every == phase and not self._withholds(message.name):
                 counter = self._counters[message.name]
                 self._counters[message.name] = (counter + 1) & 15
                 frames.append(message.encode(self.number, self._reading(message.name, truth), counter))
@@ -139,6 +140,10 @@ class Mcu:
         self.errors = 0
         frames.append(status.encode(self.number, [tick & 0xFFFF, VERSION, errors, self._state(disarmed)], tick))
         return frames
+
+    def _withholds(self, name: str) -> bool:
+        """Whether a fault keeps the MCU from sending this slow message."""
+        return self.depth.absent if name == "DEPTH" else self.readings_absent and name in ("POWER", "ENVIRONMENT")
 
     def _apply(self, command: list[float]) -> None:
         self._applied = command

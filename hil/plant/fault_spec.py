@@ -54,6 +54,10 @@ TAKES: Mapping[str, Takes] = {
     "foreign_sync": OF_ALL,
     "foreign_command": OF_ALL,
     "imu_frozen": Takes(),
+    "pressure_jump": ANY_SIZE,
+    "pressure_drift": ANY_SIZE,
+    "pressure_frozen": Takes(),
+    "pressure_absent": Takes(),
     "tag_flip": Takes(0.0, 1.0, idle=0.0),
     "tag_jump": ANY_SIZE,
     "tag_absent": Takes(),
@@ -85,8 +89,8 @@ class Fault:
     value: float = quantity(
         0.0, low=-LARGEST, high=LARGEST,
         help="weak, fake_rpm: share of the force that is left; stuck: command; loss, duplicate, corrupt, flip: share; "
-        "delay: ms; babble: frames per tick; jump, camera_bias: m; battery_sag: voltage drop, V; magnet: -1, 0, 1; jets: strength; "
-        "push: N, direction drawn per seed",
+        "delay: ms; babble: frames per tick; jump, camera_bias: m; pressure_drift: m/s of depth; battery_sag: voltage drop, V; "
+        "magnet: -1, 0, 1; jets: strength; push: N, direction drawn per seed",
     )  # fmt: skip
     direction: str = quantity("both", choices=DIRECTIONS, help="frame faults: direction in which frames are affected")
 

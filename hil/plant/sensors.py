@@ -40,15 +40,53 @@ def _sample(draw, walked, sigma, bias, truth, out):
         out[i] = truth[i] + (bias[i] + sigma * draw[width + i])
 
 
+class DepthSensor:
+    """Pressure sensor of one module.
+
+    Attributes:
+        frozen, absent: faults: it repeats its last reading; it gives none.
+    """
+
+    def __init__(self, spec: SensorSpec, world: WorldSpec, seed: int, module: int) -> None:
+        self._channel = Channel(stream(seed, "depth", module), 1, spec.depth_sigma_m, spec.depth_bias_m, spec.depth_walk)
+        self._atmosphere_pa, self._pa_per_m = world.atmosphere_pa, world.density * world.gravity
+        self._last_pa = math.nan
+        self.repair()
+
+    def repair(self) -> None:
+        """Ends all faults."""
+        self.frozen = self.absent = False
+        self._offset_m = self._drift_m_s = 0.0
+
+    def err(self, offset_m: float, drift_m_s: float, since_ns: int) -> None:
+        """Adds a fault: an offset, m, that grows by `drift_m_s` from `since_ns` on. Several add up."""
+        self._offset_m += offset_m - drift_m_s * since_ns * 1e-9
+        self._drift_m_s += drift_m_s
+
+    def error_m(self, time_s: float) -> float:
+        """Error by the faults at a time, m."""
+        return self._offset_m + self._drift_m_s * time_s
+
+    def pressure_pa(self, truth: Truth) -> float:
+        """Absolute pressure at the hull centre, Pa, as the sensor reads it."""
+        depth_m = float(self._channel.sample(truth.p_wm[2:], truth.time_ns)[0]) + self.error_m(truth.time_ns * 1e-9)
+        if not self.frozen or math.isnan(self._last_pa):
+            self._last_pa = self._atmosphere_pa + self._pa_per_m * depth_m
+        return self._last_pa
+
+
 class Sensors:
-    """Motion sensors of one module, as its MCU reads them."""
+    """Motion sensors of one module, as its MCU reads them.
+
+    Attributes:
+        depth: its pressure sensor.
+    """
 
     def __init__(self, spec: SensorSpec, world: WorldSpec, seed: int, module: int) -> None:
         s = spec
-        self._world = world
         self._gyro = Channel(stream(seed, "gyro", module), 3, s.gyro_sigma, s.gyro_bias, s.gyro_walk)
         self._accel = Channel(stream(seed, "accel", module), 3, s.accel_sigma, s.accel_bias, s.accel_walk)
-        self._depth = Channel(stream(seed, "depth", module), 1, s.depth_sigma_m, s.depth_bias_m, s.depth_walk)
+        self.depth = DepthSensor(s, world, seed, module)
 
     def gyro(self, truth: Truth) -> np.ndarray:
         """(3,) angular rate, module frame, rad/s."""
@@ -60,5 +98,4 @@ class Sensors:
 
     def pressure_pa(self, truth: Truth) -> float:
         """Absolute pressure at the hull centre, Pa."""
-        depth = float(self._depth.sample(truth.p_wm[2:], truth.time_ns)[0])
-        return self._world.atmosphere_pa + self._world.density * self._world.gravity * depth
+        return self.depth.pressure_pa(truth)

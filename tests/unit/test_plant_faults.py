@@ -83,6 +83,8 @@ SINGLE = (
     Fault(kind="imu_frozen"), Fault(kind="imu_frozen", module=1), Fault(kind="leak", module=2), Fault(kind="leak"),
     Fault(kind="battery_sag", value=1.8), Fault(kind="battery_sag", module=2, value=0.7), Fault(kind="readings_absent", module=1),
     Fault(kind="magnet", index=1, value=1.0), Fault(kind="magnet", value=0.0), Fault(kind="magnet", module=2, index=1, value=-1.0),
+    Fault(kind="pressure_jump", value=0.3), Fault(kind="pressure_jump", module=2, value=-5.0), Fault(kind="pressure_drift", value=0.05),
+    Fault(kind="pressure_frozen"), Fault(kind="pressure_frozen", module=1), Fault(kind="pressure_absent", module=2),
     Fault(kind="jets", value=0.9), Fault(kind="jets", value=0.0), Fault(kind="push", value=2.0), Fault(kind="push", module=1, value=-0.7),
 )  # fmt: skip
 
@@ -97,7 +99,8 @@ def fault_state(nodes: Nodes) -> list[object]:
     levels = world._thrusters.level[:, 0].tolist(), world._thrusters.constants[:, 0].tolist()
     supply = world._thrusters.supply[:, 1].tolist()
     told = [(m.frozen, m.leaks, m.readings_absent) for m in mcus]
-    return [*levels, supply, world.docks.relays.tolist(), world.push.tolist(), world.jet_strength, told]
+    depths = [(m.depth.frozen, m.depth.absent, round(m.depth.error_m(1.0), 2)) for m in mcus]  # a drift begins at its own time
+    return [*levels, supply, world.docks.relays.tolist(), world.push.tolist(), world.jet_strength, told, depths]
 
 
 def lasting(fault: Fault, at_s: float, until_s: float) -> Fault:
@@ -196,6 +199,33 @@ def test_readings_of_battery_and_cabin_stay_away() -> None:
     frames, others = fly(nodes_with(Fault(kind="readings_absent")), 100, u=0.0), fly(nodes_with(), 100, u=0.0)
     for name, is_there in (("POWER", False), ("ENVIRONMENT", False), ("DEPTH", True), ("MCU_STATUS", True)):
         assert values(others, name) and bool(values(frames, name)) == is_there
+
+
+def depths(*faults: Fault, ticks: int = 100) -> np.ndarray:
+    """(k,) depths by the pressure of module 1, m, in the order of their frames, 20 ms apart."""
+    pa = np.array([reading[0] for reading in values(fly(nodes_with(*faults), ticks, u=0.0), "DEPTH")])
+    return (pa - 101_325.0) / 9_790.0
+
+
+def test_pressure_jumps_and_drifts_from_its_time_on_and_both_add_up() -> None:
+    whole = depths()
+    jumped, drifted = depths(Fault(kind="pressure_jump", value=0.3, at_s=0.5)), depths(Fault(kind="pressure_drift", value=-0.2, at_s=0.5))
+    since_s = 0.02 * np.arange(whole.size) - 0.5
+    np.testing.assert_allclose(jumped - whole, 0.3 * (since_s > -0.01), atol=5e-4)
+    np.testing.assert_allclose(drifted - whole, -0.2 * np.maximum(0.0, since_s), atol=5e-3)
+    both = depths(Fault(kind="pressure_jump", value=0.3), Fault(kind="pressure_drift", value=-0.2, at_s=0.5))
+    np.testing.assert_allclose(both - drifted, 0.3, atol=5e-4)
+
+
+def test_pressure_freezes_at_its_last_reading_and_lives_again() -> None:
+    frozen, whole = depths(Fault(kind="pressure_frozen", at_s=0.5, until_s=1.0)), depths()
+    assert len(set(whole[25:50])) > 5 and len(set(frozen[25:49])) == 1
+    np.testing.assert_array_equal(frozen[50:], whole[50:])
+
+
+def test_pressure_sensor_falls_silent_and_nothing_else_does() -> None:
+    frames = fly(nodes_with(Fault(kind="pressure_absent")), 100, u=0.0)
+    assert not values(frames, "DEPTH") and values(frames, "POWER") and values(frames, "MCU_STATUS")
 
 
 def tags(*faults: Fault, ticks: int = 60) -> np.ndarray:
