@@ -105,6 +105,15 @@ ROWS = (
         "IMU frozen", "holds the place; 30 mm", _fault("imu_frozen"), ends=_to("POSHOLD", *_all_but("SURFACE")), within_s=1.0,
         error_m=0.030, says="no IMU for",
     ),
+    Row("pressure jumps by 5 m", "is not used, warns; 20 mm", _fault("pressure_jump", 5.0), error_m=0.020, says="no pressure for"),
+    Row("pressure jumps by 0.3 m", "learns the offset; 20 mm", _fault("pressure_jump", 0.3), error_m=0.020),
+    Row("pressure drifts by 50 mm/s", "is not used, warns; 20 mm", _fault("pressure_drift", 0.05), error_m=0.020, says="no pressure for"),
+    Row("pressure frozen", "is not used, warns; 20 mm", _fault("pressure_frozen"), error_m=0.020, says="no pressure for"),
+    Row("pressure absent", "warns; 20 mm", _fault("pressure_absent"), error_m=0.020, says="no pressure for"),
+    Row(
+        "pressure jumps, tags absent", "depth unknown, surfaces after 5 s", _fault("pressure_jump", 5.0), also=(_fault("tag_absent"),),
+        ends=_to("SURFACE", "ALT_HOLD", *PLACED), within_s=5.2, says="no pressure for",
+    ),
     Row("half of the tags flipped", "as before; 20 mm", _fault("tag_flip", 0.5), error_m=0.020),
     Row("tags jump by 100 mm", "follows the tags; 130 mm", _fault("tag_jump", 0.1), error_m=0.130),
     Row(

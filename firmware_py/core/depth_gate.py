@@ -1,9 +1,14 @@
 """Checks pressure readings against what can be, and against the depth that the tags tell. Runs after `sensor_watch`, before stage 1.
 
 The filter takes a pressure sensor to err by a few centimetres and drift slowly. One that errs by metres would overrule perfect tags: the
-filter would refuse these, and the robot swim to the surface. So while tags come, a reading that is far from the estimate is not used. A
-sensor that stays there steadily is corrected by that offset where it may have one: weather, a lake above the sea, the datum of the tags.
-One that does not is distrusted, and remains so without tags: then the depth is unknown rather than wrong.
+filter would refuse these, and the robot swim to the surface. So while tags come, a reading that is far from the estimate is not used, nor
+one of a sensor that drifts away from the tags (`depth_datum`). A sensor that stays off steadily is corrected by that offset where it may
+have one: weather, a lake above the sea, the datum of the tags. One that does not is distrusted, and remains so without tags: then the depth
+is unknown rather than wrong.
+
+Without tags the estimate is no judge of a sensor: a push that no model knows makes it wrong, and the sensor is right. But no body goes
+farther than it can between two readings. A sensor that does is not used until it is back; the filter would explain metres within a tick by
+tilt, and turn the robot over.
 """
 
 from __future__ import annotations
@@ -13,9 +18,11 @@ import math
 from collections.abc import Sequence
 
 from firmware_py.core.body import Body
+from firmware_py.core.depth_datum import DepthDatum
 from firmware_py.core.measurements import ATMOSPHERE_PA
 from firmware_py.core.observation import GRAVITY
-from firmware_py.core.types import ExpectedDepth, ModuleInputs
+from firmware_py.core.rotations import to_matrix
+from firmware_py.core.types import BodyPose, ExpectedDepth, ModuleInputs
 from firmware_py.description.water import WATER_DENSITY
 
 PA_PER_M = WATER_DENSITY * GRAVITY
@@ -28,6 +35,8 @@ GATE_SIGMAS, LEAST_GATE_M = 5.0, 0.04
 most, in force-tracking, elsewhere by 15. With a gate of 50 mm a sensor that drifts by 20 cm/s takes the estimate along."""
 MOST_STEP_M = 0.5
 """Largest offset that a sensor may take on in flight: five sigmas of the filter's initial depth bias."""
+MOST_SPEED_M_S = 2.0
+"""Greatest speed up or down: four times that of a module at full thrust, and that of a body dropped from 0.2 m."""
 DOUBT = 25
 """Readings, half a second of DEPTH frames: so many refused ones more than accepted ones make a sensor distrusted, so many steady ones in a
 row show an offset, and so many accepted ones make it trusted again. Half of the limit of the fail-safe `depth_lost`."""
@@ -51,10 +60,21 @@ class DepthGate:
         for other in before:
             self._sensors |= {module: sensor for module, sensor in other._sensors.items() if module in self._sensors}
 
-    def step(self, modules: Sequence[ModuleInputs], expected: ExpectedDepth | None, armed: bool) -> Sequence[ModuleInputs]:
+    def compare(self, pictures: Sequence[BodyPose]) -> None:
+        """Compares the sensors with the pictures that the filter accepted in this tick."""
+        for pose in pictures:
+            down = to_matrix(pose.q_wb)[2]
+            depth_m = float(pose.p_wt[2] - down.dot(pose.lever_b))
+            for index, sensor in self._sensors.items():
+                sensor.datum.compare(pose.capture_ns, depth_m + float(down.dot(self._r_bi[index])))
+
+    def step(
+        self, time_ns: int, modules: Sequence[ModuleInputs], expected: ExpectedDepth | None, armed: bool
+    ) -> Sequence[ModuleInputs]:
         """Returns the inputs of the fleet, by fleet index, without the false pressures of this body, the others less their offset.
 
         Args:
+            time_ns: time of this tick.
             expected: where the depth is to be by the estimate; None unless tags tell it.
             armed: whether the body flies; while it does not, a sensor that was trusted may take on any offset, as in another tank.
         """
@@ -63,20 +83,21 @@ class DepthGate:
             pressure_pa = modules[index].pressure_pa
             if pressure_pa is None:
                 continue
-            passed = LEAST_PA <= pressure_pa <= self._most_pa and self._passes(index, pressure_pa, expected, armed)
+            passed = LEAST_PA <= pressure_pa <= self._most_pa and self._passes(index, time_ns, pressure_pa, expected, armed)
             self.heard = self.heard or passed
             if not passed or sensor.offset_m:
                 corrected_pa = pressure_pa - sensor.offset_m * PA_PER_M if passed else None
                 believed[index] = dataclasses.replace(modules[index], pressure_pa=corrected_pa)
         return believed
 
-    def _passes(self, index: int, pressure_pa: float, expected: ExpectedDepth | None, armed: bool) -> bool:
+    def _passes(self, index: int, time_ns: int, pressure_pa: float, expected: ExpectedDepth | None, armed: bool) -> bool:
         """Whether a possible reading may be used."""
-        sensor = self._sensors[index]
+        sensor, told_m = self._sensors[index], (pressure_pa - ATMOSPHERE_PA) / PA_PER_M
+        sensor.hear(time_ns, told_m)
         if expected is None:
-            return not sensor.is_distrusted
+            return sensor.is_continuous()
         below_m = sum(r * down for r, down in zip(self._r_bi[index], expected.down_b, strict=True))
-        error_m = (pressure_pa - ATMOSPHERE_PA) / PA_PER_M - below_m - expected.depth_m
+        error_m = told_m - below_m - expected.depth_m
         most_m = MOST_STEP_M if armed and sensor.was_trusted else math.inf
         return sensor.agrees(error_m, max(LEAST_GATE_M, GATE_SIGMAS * expected.sigma_m), most_m)
 
@@ -93,28 +114,51 @@ class _Sensor:
     def __init__(self) -> None:
         self.offset_m = 0.0
         self.is_distrusted = self.was_trusted = False
+        self.datum = DepthDatum()
         self._doubt, self._steady, self._low, self._high = 0, 0, 0.0, 0.0
+        self._last_m, self._last_ns, self._jumped_m = math.nan, 0, 0.0
+        """Last possible reading, and how far the sensor has jumped since it last agreed with tags or came back."""
+
+    def hear(self, time_ns: int, depth_m: float) -> None:
+        """Notes a possible reading, and whether the sensor jumped to it: farther than a body can go since the reading before."""
+        self.datum.hear(time_ns, depth_m)
+        moved_m, most_m = depth_m - self._last_m, min(LEAST_GATE_M + MOST_SPEED_M_S * 1e-9 * (time_ns - self._last_ns), MOST_STEP_M)
+        if abs(moved_m) > most_m:
+            self._jumped_m += moved_m
+            self._jumped_m = self._jumped_m if abs(self._jumped_m) > most_m else 0.0
+        self._last_m, self._last_ns = depth_m, time_ns
+
+    def is_continuous(self) -> bool:
+        """Whether a reading without tags may be used: the sensor is trusted, and has not jumped."""
+        if self._jumped_m:
+            self._count_doubt()
+        return not self.is_distrusted and not self._jumped_m
 
     def agrees(self, error_m: float, gate_m: float, most_m: float) -> bool:
         """Whether a reading that is off by `error_m` is within the gate and the sensor trusted. Learns an offset of at most `most_m`."""
         error_m -= self.offset_m
-        if abs(error_m) > gate_m:
+        if abs(error_m) > gate_m or self.datum.errs:
             self._differ(error_m, gate_m, most_m)
             return False
-        self._steady, self._doubt = 0, max(self._doubt - 1, 0)
+        self._steady, self._doubt, self._jumped_m = 0, max(self._doubt - 1, 0), 0.0
         self.is_distrusted = self.is_distrusted and self._doubt > 0
         self.was_trusted = self.was_trusted or self._doubt == 0
         return not self.is_distrusted
 
     def _differ(self, error_m: float, gate_m: float, most_m: float) -> None:
-        """Notes a reading outside the gate."""
-        self._doubt = min(self._doubt + 1, DOUBT)
-        self.is_distrusted = self.is_distrusted or self._doubt == DOUBT
+        """Notes a reading outside the gate, or of a sensor that drifts."""
+        self._count_doubt()
         self._low, self._high = (min(self._low, error_m), max(self._high, error_m)) if self._steady else (error_m, error_m)
         if self._high - self._low > gate_m:
             self._steady, self._low, self._high = 0, error_m, error_m
         self._steady += 1
-        offset_m = 0.5 * (self._low + self._high)
-        if self._steady >= DOUBT and abs(offset_m) <= most_m:
+        middle_m = 0.5 * (self._low + self._high)
+        offset_m = middle_m if abs(middle_m) > gate_m or math.isnan(self.datum.shift_m) else self.datum.shift_m
+        if self._steady >= DOUBT and self.datum.is_steady and abs(offset_m) <= most_m:
             self.offset_m += offset_m
+            self.datum.take_as_usual()
             self._steady, self._doubt, self.is_distrusted, self.was_trusted = 0, 0, False, True
+
+    def _count_doubt(self) -> None:
+        self._doubt = min(self._doubt + 1, DOUBT)
+        self.is_distrusted = self.is_distrusted or self._doubt == DOUBT

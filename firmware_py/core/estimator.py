@@ -100,6 +100,8 @@ class Estimator:
         self._tag_agreement, self._last_accel_ns, self._last_depth_ns = TagAgreement(), 0, 0
         self._nis = math.nan
         self._nis_dof = 0
+        self.fused: list[BodyPose] = []
+        """Pictures that the last tick accepted."""
 
     def retune(self, parameters: Estimation) -> None:
         """Applies new noise parameters from the next tick on; the estimate stays."""
@@ -137,7 +139,7 @@ class Estimator:
             measured: fused measurements of all sensors.
             tau: (6,) mean thruster wrench since the previous tick, body frame.
         """
-        self._nis, self._nis_dof = math.nan, 0
+        self._nis, self._nis_dof, self.fused = math.nan, 0, []
         if self._history.newest >= 0 and time_ns - self._history.newest_ns > WINDOW_NS:
             self._accepted = self._waited = 0  # the process was suspended: the history does not reach back to the anchor
         self._history.push(time_ns, tau, measured.gyro, measured.accel, measured.depth_m)
@@ -283,6 +285,7 @@ class Estimator:
         self._nis = nis if math.isnan(self._nis) else self._nis + nis
         self._nis_dof += 6
         self._accepted += 1
+        self.fused.append(pose)
         self._refused_in_row = 0
         self._last_tag_ns, self._last_accept_ns = pose.capture_ns, self._history.newest_ns
 

@@ -61,6 +61,9 @@ class TagOnlyEstimator:
         """(4,) latest attitude."""
         return self._q_wb
 
+    fused = ()
+    """No pictures to compare pressures with: this filter takes no depth."""
+
     def expected_depth(self, time_ns: int) -> None:
         """No depth: this filter takes none."""
 

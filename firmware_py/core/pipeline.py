@@ -102,11 +102,13 @@ class BodyPipeline:
         mean_n = self.lag.step()
         believed = self.sensors.step(inputs.modules)
         if self.sensors.pressure_heard:
-            believed = self.depth_gate.step(believed, self.estimator.expected_depth(inputs.time_ns), self.supervisor.armed)
+            expected = self.estimator.expected_depth(inputs.time_ns)
+            believed = self.depth_gate.step(inputs.time_ns, believed, expected, self.supervisor.armed)
         self.health.imu_heard = self.sensors.imu_heard
         self.health.pressure_heard = self.sensors.pressure_heard and self.depth_gate.heard
         measured = self.measurements.fuse(believed, self.estimator.q_wb)
         estimate = self.estimator.step(inputs.time_ns, measured, self.body.thrusters.matrix.dot(mean_n))
+        self.depth_gate.compare(self.estimator.fused)
         self._find_faults(inputs, measured, estimate, mean_n)
         return estimate
 

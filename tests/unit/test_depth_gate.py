@@ -1,5 +1,6 @@
 """Pressure that cannot be, or that contradicts the tags, is not believed: a false one would take the robot to the surface."""
 
+import itertools
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -18,6 +19,8 @@ PAIR = assemble([(0, 0, 0), (0, 0, 1)], [0, 0], [load_vehicle("modcube")] * 2)
 LEVEL = (0.0, 0.0, 1.0)
 DEPTH_HZ = 50.0
 """Rate of the DEPTH frames."""
+CLOCK = itertools.count(0, round(1e9 / DEPTH_HZ))
+"""Time of each reading, ns."""
 AT_3_M = ExpectedDepth(3.0, 0.003, LEVEL)
 
 
@@ -29,7 +32,7 @@ def told(gate: DepthGate, depths_m: Sequence[float], expected: ExpectedDepth | N
     """The depths that are left of readings of a single module."""
     left = []
     for depth_m in depths_m:
-        (module,) = gate.step([ModuleInputs(pressure_pa=pressure_at(depth_m))], expected, armed)
+        (module,) = gate.step(next(CLOCK), [ModuleInputs(pressure_pa=pressure_at(depth_m))], expected, armed)
         assert gate.heard == (module.pressure_pa is not None)
         left.append(None if module.pressure_pa is None else round((module.pressure_pa - ATMOSPHERE_PA) / PA_PER_M, 4))
     return left
@@ -45,14 +48,14 @@ def trusted() -> DepthGate:
 def test_pressure_far_below_the_atmosphere_or_far_deeper_than_the_hull_stands_is_not_believed_even_without_tags(pressure_pa: float) -> None:
     """The module is made for 50 m."""
     gate = DepthGate(single())
-    (module,) = gate.step([ModuleInputs(pressure_pa=pressure_pa, heard=True)], None, armed=False)
+    (module,) = gate.step(next(CLOCK), [ModuleInputs(pressure_pa=pressure_pa, heard=True)], None, armed=False)
     assert module.pressure_pa is None and module.heard and not gate.heard
 
 
 @pytest.mark.parametrize("pressure_pa", [63e3, 101e3, 600e3])
 def test_pressure_in_a_lake_high_above_the_sea_and_at_the_greatest_permitted_depth_is_believed(pressure_pa: float) -> None:
     gate = DepthGate(single())
-    assert gate.step([ModuleInputs(pressure_pa=pressure_pa)], None, armed=False)[0].pressure_pa == pressure_pa
+    assert gate.step(next(CLOCK), [ModuleInputs(pressure_pa=pressure_pa)], None, armed=False)[0].pressure_pa == pressure_pa
 
 
 def test_offset_of_some_decimetres_is_learnt_in_half_a_second_and_never_reaches_the_estimate() -> None:
@@ -117,14 +120,14 @@ def test_each_module_is_judged_by_itself_where_it_is() -> None:
     """The second module hangs 0.21 m below the first; the one of them that errs stays known to a body that takes over."""
     gate, above, below = DepthGate(PAIR), pressure_at(3.0 - 0.105), pressure_at(3.0 + 0.105)
     for _ in range(2):
-        left = gate.step([ModuleInputs(pressure_pa=above), ModuleInputs(pressure_pa=below)], AT_3_M, armed=True)
+        left = gate.step(next(CLOCK), [ModuleInputs(pressure_pa=above), ModuleInputs(pressure_pa=below)], AT_3_M, armed=True)
         assert [module.pressure_pa for module in left] == [above, below]
     for _ in range(DOUBT):
-        left = gate.step([ModuleInputs(pressure_pa=above), ModuleInputs(pressure_pa=below + 5e4)], AT_3_M, armed=True)
+        left = gate.step(next(CLOCK), [ModuleInputs(pressure_pa=above), ModuleInputs(pressure_pa=below + 5e4)], AT_3_M, armed=True)
         assert [module.pressure_pa for module in left] == [above, None] and gate.heard
     part = DepthGate(single(1))
     part.take_over([gate])
-    part.step([ModuleInputs(), ModuleInputs(pressure_pa=below)], None, armed=True)
+    part.step(next(CLOCK), [ModuleInputs(), ModuleInputs(pressure_pa=below)], None, armed=True)
     assert not part.heard
 
 

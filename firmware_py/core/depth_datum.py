@@ -1,0 +1,89 @@
+"""Compares a pressure sensor with the tags, reading by picture. For `depth_gate`, which decides what follows from it.
+
+The estimate is no witness against a sensor that drifts, because it follows the sensor: at 3 mm a reading outweighs the tags until the filter
+refuses these. The tags alone are: each accepted picture is compared with the pressure at the time of the picture, so that neither the motion
+of the body nor the filter matters. What is left is the sensor's offset, with a few millimetres of noise.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import deque
+
+READINGS = 32
+"""Readings kept, 0.64 s of DEPTH frames: the bus refuses pictures older than half a second."""
+PICTURES, LATEST = 32, 8
+"""Pictures whose offsets are kept, half a second, and those of them that count as the present offset."""
+USUAL_OF = 600
+"""Pictures over which the usual offset is averaged, ten seconds: a healthy sensor walks 0.6 mm meanwhile."""
+NOISE_M = 0.005
+"""Noise of the offset by one picture for which the limits below hold, that of the bench's tags; they grow with more."""
+SHIFT_M = 0.012
+"""Difference of the present offset from the usual one beyond which a sensor errs. On the bench healthy sensors differ by 6 mm at most."""
+MOVING_M, STEADY_M = 0.010, 0.005
+"""Change of the offset from one half of the pictures to the other, a quarter of a second apart, beyond which it moves (4 cm/s), and up to
+which it counts as steady. Its noise is 1.8 mm; on the bench that of healthy sensors is 7 mm at most."""
+MEDIAN_STEP = 0.95
+"""Median of the steps between two draws of white noise, in its standard deviations: 0.674 sqrt(2)."""
+
+
+class DepthDatum:
+    """Offset of one pressure sensor from the depth that the tags tell. Bounded memory."""
+
+    def __init__(self) -> None:
+        self._readings: deque[tuple[int, float]] = deque(maxlen=READINGS)
+        self._offsets: deque[float] = deque(maxlen=PICTURES)
+        self._usual_m = math.nan
+        self.shift_m = self._change_m = math.nan
+        """Present offset less the usual one, and change of the offset within the pictures kept, m; NaN until known."""
+        self._scale = 1.0
+        """Factor of all limits, by the noise of the pictures kept."""
+
+    @property
+    def errs(self) -> bool:
+        """Whether the sensor tells another depth than it used to, or one that moves away from the tags."""
+        return abs(self.shift_m) > SHIFT_M * self._scale or abs(self._change_m) > MOVING_M * self._scale
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether the offset stays as it is, by the last half second of pictures; true while there are too few of them."""
+        return not abs(self._change_m) > STEADY_M * self._scale
+
+    def hear(self, time_ns: int, depth_m: float) -> None:
+        """Keeps a reading: depth of the sensor by its pressure."""
+        self._readings.append((time_ns, depth_m))
+
+    def compare(self, capture_ns: int, depth_m: float) -> None:
+        """Compares the sensor with the depth at which a picture shows it. Leaves out pictures without a reading before and after."""
+        told_m = self._told_at(capture_ns)
+        if math.isnan(told_m):
+            return
+        self._offsets.append(told_m - depth_m)
+        if len(self._offsets) < PICTURES:
+            return
+        half = PICTURES // 2
+        earlier, later = sum(itertools.islice(self._offsets, half)), sum(itertools.islice(self._offsets, half, None))
+        self._change_m = (later - earlier) / half
+        steps = sorted(abs(after - before) for before, after in itertools.pairwise(self._offsets))
+        self._scale = max(1.0, steps[half - 1] / (MEDIAN_STEP * NOISE_M))
+        if math.isnan(self._usual_m) and self.is_steady:
+            self._usual_m = (earlier + later) / PICTURES
+        self.shift_m = sum(itertools.islice(self._offsets, PICTURES - LATEST, None)) / LATEST - self._usual_m
+        if not self.errs:
+            self._usual_m += (self._offsets[-1] - self._usual_m) / USUAL_OF
+
+    def take_as_usual(self) -> None:
+        """Counts the present offset as the usual one, if both are known."""
+        self._usual_m += self.shift_m
+        self.shift_m *= 0.0
+
+    def _told_at(self, time_ns: int) -> float:
+        """Depth by the sensor at a time between two readings, m; NaN elsewhere."""
+        after_ns, after_m = math.nan, math.nan
+        for at_ns, depth_m in reversed(self._readings):
+            if at_ns <= time_ns:
+                share = (time_ns - at_ns) / (after_ns - at_ns)
+                return depth_m + share * (after_m - depth_m)
+            after_ns, after_m = at_ns, depth_m
+        return math.nan
