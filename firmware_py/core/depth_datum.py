@@ -1,8 +1,8 @@
 """Compares a pressure sensor with the tags, reading by picture. For `depth_gate`, which decides what follows from it.
 
-The estimate is no witness against a sensor that drifts, because it follows the sensor: at 3 mm a reading outweighs the tags until the filter
-refuses these. The tags alone are: each accepted picture is compared with the pressure at the time of the picture, so that neither the motion
-of the body nor the filter matters. What is left is the sensor's offset, with a few millimetres of noise.
+The estimate is no witness against a sensor that drifts, because it follows the sensor: at 3 mm a reading outweighs the tags, until the
+filter refuses these. The tags alone are: each accepted picture is compared with the pressure at the time of the picture, so that neither
+the motion of the body nor the filter matters. What is left is the sensor's offset, with a few millimetres of noise.
 """
 
 from __future__ import annotations

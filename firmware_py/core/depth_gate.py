@@ -36,7 +36,7 @@ most, in force-tracking, elsewhere by 15. With a gate of 50 mm a sensor that dri
 MOST_STEP_M = 0.5
 """Largest offset that a sensor may take on in flight: five sigmas of the filter's initial depth bias."""
 MOST_SPEED_M_S = 2.0
-"""Greatest speed up or down: four times that of a module at full thrust, and that of a body dropped from 0.2 m."""
+"""Greatest speed up or down: twice that of a module at full thrust, and that of a body dropped from 0.2 m."""
 DOUBT = 25
 """Readings, half a second of DEPTH frames: so many refused ones more than accepted ones make a sensor distrusted, so many steady ones in a
 row show an offset, and so many accepted ones make it trusted again. Half of the limit of the fail-safe `depth_lost`."""
