@@ -35,8 +35,8 @@ GATE_SIGMAS, LEAST_GATE_M = 5.0, 0.04
 most, in force-tracking, elsewhere by 15. With a gate of 50 mm a sensor that drifts by 20 cm/s takes the estimate along."""
 MOST_STEP_M = 0.5
 """Largest offset that a sensor may take on in flight: five sigmas of the filter's initial depth bias."""
-MOST_SPEED_M_S = 2.0
-"""Greatest speed up or down: twice that of a module at full thrust, and that of a body dropped from 0.2 m."""
+MOST_SPEED_M_S, DROP_SPEED_M_S = 2.0, 6.0
+"""Greatest speed up or down of a body that is armed, twice that of a module at full thrust; and of one that is not, dropped from 2 m."""
 DOUBT = 25
 """Readings, half a second of DEPTH frames: so many refused ones more than accepted ones make a sensor distrusted, so many steady ones in a
 row show an offset, and so many accepted ones make it trusted again. Half of the limit of the fail-safe `depth_lost`."""
@@ -76,7 +76,8 @@ class DepthGate:
         Args:
             time_ns: time of this tick.
             expected: where the depth is to be by the estimate; None unless tags tell it.
-            armed: whether the body flies; while it does not, a sensor that was trusted may take on any offset, as in another tank.
+            armed: whether the body flies; while it does not, a sensor that was trusted may take on any offset, as in another tank, and the
+                body may fall into the water.
         """
         self.heard, believed = False, list(modules)
         for index, sensor in self._sensors.items():
@@ -93,7 +94,7 @@ class DepthGate:
     def _passes(self, index: int, time_ns: int, pressure_pa: float, expected: ExpectedDepth | None, armed: bool) -> bool:
         """Whether a possible reading may be used."""
         sensor, told_m = self._sensors[index], (pressure_pa - ATMOSPHERE_PA) / PA_PER_M
-        sensor.hear(time_ns, told_m)
+        sensor.hear(time_ns, told_m, MOST_SPEED_M_S if armed else DROP_SPEED_M_S)
         if expected is None:
             return sensor.is_continuous()
         below_m = sum(r * down for r, down in zip(self._r_bi[index], expected.down_b, strict=True))
@@ -119,10 +120,10 @@ class _Sensor:
         self._last_m, self._last_ns, self._jumped_m = math.nan, 0, 0.0
         """Last possible reading, and how far the sensor has jumped since it last agreed with tags or came back."""
 
-    def hear(self, time_ns: int, depth_m: float) -> None:
-        """Notes a possible reading, and whether the sensor jumped to it: farther than a body can go since the reading before."""
+    def hear(self, time_ns: int, depth_m: float, speed_m_s: float) -> None:
+        """Notes a possible reading, and whether the sensor jumped to it: farther than a body goes at `speed_m_s` since the one before."""
         self.datum.hear(time_ns, depth_m)
-        moved_m, most_m = depth_m - self._last_m, min(LEAST_GATE_M + MOST_SPEED_M_S * 1e-9 * (time_ns - self._last_ns), MOST_STEP_M)
+        moved_m, most_m = depth_m - self._last_m, min(LEAST_GATE_M + speed_m_s * 1e-9 * (time_ns - self._last_ns), MOST_STEP_M)
         if abs(moved_m) > most_m:
             self._jumped_m += moved_m
             self._jumped_m = self._jumped_m if abs(self._jumped_m) > most_m else 0.0
@@ -157,7 +158,7 @@ class _Sensor:
         if self._steady >= DOUBT and self.datum.is_steady and abs(offset_m) <= most_m:
             self.offset_m += offset_m
             self.datum.take_as_usual()
-            self._steady, self._doubt, self.is_distrusted, self.was_trusted = 0, 0, False, True
+            self._steady, self._doubt, self._jumped_m, self.is_distrusted, self.was_trusted = 0, 0, 0.0, False, True
 
     def _count_doubt(self) -> None:
         self._doubt = min(self._doubt + 1, DOUBT)

@@ -38,10 +38,14 @@ def told(gate: DepthGate, depths_m: Sequence[float], expected: ExpectedDepth | N
     return left
 
 
-def trusted() -> DepthGate:
+def trusted_at(depth_m: float) -> DepthGate:
     gate = DepthGate(single())
-    assert told(gate, [3.01] * 5) == [3.01] * 5
+    assert told(gate, [depth_m] * 5, AT_3_M._replace(depth_m=depth_m)) == [depth_m] * 5
     return gate
+
+
+def trusted() -> DepthGate:
+    return trusted_at(3.01)
 
 
 @pytest.mark.parametrize("pressure_pa", [0.0, 41e3, 1.0e6, 1.3e6])
@@ -102,13 +106,15 @@ def test_sensor_that_jumped_just_before_the_tags_went_is_not_used_without_them()
 
 
 def test_sensor_is_followed_as_fast_as_a_body_can_go_without_tags() -> None:
-    """Its reading may also come late, as after lost frames; but for long silent, it is not believed wherever it is."""
+    """A disarmed body may fall into the water, and a reading may come late, as after lost frames; after long silence not any counts."""
     dives = [3.0 + MOST_SPEED_M_S / DEPTH_HZ * n for n in range(100)]
     gate = trusted()
     assert None not in told(gate, dives, None)
+    drops = [0.0, 0.12, 0.22, 0.26]
+    assert told(trusted_at(0.0), drops, None, armed=False) == drops
+    assert told(trusted_at(0.0), drops, None) == [0.0, None, None, None]
     for silence_s, moved_m, is_believed in ((0.2, 0.42, True), (0.2, 0.48, False), (60.0, MOST_STEP_M - 0.01, True), (60.0, 5.0, False)):
-        gate = trusted()
-        gate.step(next(CLOCK), [ModuleInputs(pressure_pa=pressure_at(3.0))], None, armed=True)
+        gate = trusted_at(3.0)
         for _ in range(round(silence_s * DEPTH_HZ) - 1):
             next(CLOCK)
         assert (told(gate, [3.0 + moved_m], None) != [None]) == is_believed, (silence_s, moved_m)
