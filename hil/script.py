@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -18,6 +17,7 @@ from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError, frozen_array
 from firmware_py.prepare import paths
 from firmware_py.prepare.assembly import assemble_fleet, check_fleet
+from firmware_py.prepare.minimum_snap import InfeasibleError
 from firmware_py.prepare.waypoints import Mission, line_of, read_mission
 from hil.orders import Orders, is_time_to_arm
 from hil.scenario import Scenario, Task
@@ -29,8 +29,6 @@ APART_M, APART_DEG = 0.01, 1.0
 """Tolerance between the first waypoint and the start: allows for rounding in a spreadsheet, but is no move of its own before the task."""
 LOOKS = 500
 """Number of points of a path that are checked: every 3 cm of the longest path flown here."""
-BETWEEN = re.compile(r"between waypoints \d+ and (\d+)")
-"""How the planner names a piece that cannot be flown (prepare/minimum_snap.py)."""
 LONGER_S = 1e-6
 """Rounding tolerance of a path's duration against its task's."""
 
@@ -156,7 +154,7 @@ def _waypoints(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
         mission.check_bounded()
         path = mission.plan(assemble_fleet(fleet, vehicles_of(fleet))[0], stretch=False)
     except ValueError as error:
-        raise _infeasible(str(error), task) from None
+        raise _infeasible(error, task) from None
     first = path.sample(0.0)
     apart_m = float(np.linalg.norm(first.p_wb - start.p_wb))
     apart_deg = math.degrees(float(np.linalg.norm(rotations.difference(start.q_wb, first.q_wb))))
@@ -168,11 +166,11 @@ def _waypoints(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
     return path
 
 
-def _infeasible(what: str, task: Task) -> DescriptionError:
+def _infeasible(error: ValueError, task: Task) -> DescriptionError:
     """The error for a file whose path cannot be flown: with the line of the waypoint at which a piece ends that is too fast."""
-    if (piece := BETWEEN.search(what)) is None:
-        return DescriptionError(f"{task.file}: {what}")
-    return DescriptionError(f"{task.file}:{line_of(task.file_text, task.file, int(piece[1]))}: {what}; allow more time")
+    if not isinstance(error, InfeasibleError) or error.piece is None:
+        return DescriptionError(f"{task.file}: {error}")
+    return DescriptionError(f"{task.file}:{line_of(task.file_text, task.file, error.piece + 1)}: {error}; allow more time")
 
 
 def _refuse_unbounded(mission: Mission, file: str) -> None:

@@ -14,7 +14,7 @@ import numpy as np
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
 from firmware_py.prepare.piecewise import Piecewise
-from firmware_py.prepare.snap_limits import InfeasibleError, Limits, crests, planes, solve_limited, worst
+from firmware_py.prepare.snap_limits import InfeasibleError, Limits, Place, crests, place_on, planes, solve_limited, worst
 from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
 from firmware_py.prepare.snap_thrust import divide, sag, usage
 
@@ -258,18 +258,19 @@ class _Request:
             self._check_motion(self.body, grid[..., :19].reshape(-1, 19), lambda k: _place(found, fine, k), _CHECK_POINTS + 1)
         return found
 
-    def _check_turning(self, grid: np.ndarray, place: Callable[[int], str]) -> None:
+    def _check_turning(self, grid: np.ndarray, place: Callable[[int], Place]) -> None:
         """Refuses a grid (pieces, points, 20) that turns too far or too fast; `place` as for `_check_motion`."""
         if (shortest := float(grid[..., 19].min())) < _SHORTEST_QUATERNION:
             where = place(int(np.argmin(grid[..., 19])))
-            raise InfeasibleError(f"attitude turns too far {where} (length {shortest:.2f}); add a waypoint there")
+            raise InfeasibleError(f"attitude turns too far {where.words} (length {shortest:.2f}); add a waypoint there", where.piece)
         rate, change = self.limits.angular_rate, self.limits.angular_acceleration
         for bound, columns, unit in ((rate, slice(10, 13), "rad/s"), (change, slice(16, 19), "rad/s^2")):
             if bound is None:
                 continue
             largest, at = _largest(np.linalg.norm(grid[..., columns], axis=-1))
             if largest > bound:
-                raise InfeasibleError(f"turning takes {largest:.3g} {unit} of at most {bound:g} {unit} {place(at)}")
+                where = place(at)
+                raise InfeasibleError(f"turning takes {largest:.3g} {unit} of at most {bound:g} {unit} {where.words}", where.piece)
 
     def check_standing(self) -> None:
         """Refuses attitudes that the body cannot hold even at rest. Raises InfeasibleError."""
@@ -277,9 +278,9 @@ class _Request:
             return
         still = np.zeros((len(self.attitude.value), 19))
         still[:, 3:7] = self.attitude.value
-        self._check_motion(self.body, still, lambda k: f"to stand still at waypoint {k}")
+        self._check_motion(self.body, still, lambda k: Place(f"to stand still at waypoint {k}"))
 
-    def _check_motion(self, body: Body, motion: np.ndarray, place: Callable[[int], str], run: int = 1) -> None:
+    def _check_motion(self, body: Body, motion: np.ndarray, place: Callable[[int], Place], run: int = 1) -> None:
         """Refuses (k, 19) motion that needs more than thrusters and buoyancy give; `place` describes where row k is.
 
         Each `run` of rows samples a smooth motion, which is checked between the rows too.
@@ -289,16 +290,20 @@ class _Request:
         k, axis = divmod(flat, 6)
         if lacking := abs(float(part.lacking[k, axis])):
             what = f"{lacking:.2g} {'N along' if axis < 3 else 'N m about'} the robot's {'xyz'[axis % 3]}"
-            raise _UnreachableError(f"neither thrusters nor buoyancy give {what}, which it takes {place(k)}")
+            where = place(k)
+            raise _UnreachableError(f"neither thrusters nor buoyancy give {what}, which it takes {where.words}", where.piece)
         if (falling := np.flatnonzero(np.isinf(part.lean))).size:
-            raise InfeasibleError(f"neither thrusters nor buoyancy keep the robot from falling over {place(int(falling[0]))}")
+            where = place(int(falling[0]))
+            raise InfeasibleError(f"neither thrusters nor buoyancy keep the robot from falling over {where.words}", where.piece)
         lean, k = _largest(part.lean.reshape(-1, run))
         if lean > MOST_LEAN:
             degrees = f"{math.degrees(lean):.1f} deg, of at most {math.degrees(MOST_LEAN):.1f} deg"
-            raise InfeasibleError(f"the robot would lean by {degrees}, for a moment that its thrusters do not give, {place(k)}")
+            where, what = place(k), "for a moment that its thrusters do not give"
+            raise InfeasibleError(f"the robot would lean by {degrees}, {what}, {where.words}", where.piece)
         share, k = usage(body, part.thrust, self.limits.thruster_share, sag(part.thrust, run))
         if share > self.limits.thruster_share:
-            raise InfeasibleError(_thrust_message(share, self.limits.thruster_share, place(k)))
+            where = place(k)
+            raise InfeasibleError(_thrust_message(share, self.limits.thruster_share, where.words), where.piece)
 
 
 def _check(waypoints: Sequence[Waypoint]) -> None:
@@ -335,12 +340,12 @@ def _largest(size: np.ndarray) -> tuple[float, int]:
     return float(size.max()), int(np.argmax(size))
 
 
-def _place(found: Piecewise, fine: Piecewise, flat: int) -> str:
-    """Describes the place in `found` of a flat index into the grid of `fine`, the same path in shorter pieces."""
+def _place(found: Piecewise, fine: Piecewise, flat: int) -> Place:
+    """The place in `found` of a flat index into the grid of `fine`, the same path in shorter pieces."""
     part, i = divmod(flat, _CHECK_POINTS + 1)
     time = fine.breaks[part] + i / _CHECK_POINTS * (fine.breaks[part + 1] - fine.breaks[part])
     piece = int(np.searchsorted(found.breaks, fine.breaks[part], side="right")) - 1
-    return f"between waypoints {piece} and {piece + 1}, at {time:.2f} s"
+    return place_on(piece, float(time))
 
 
 def _continuous(waypoints: Sequence[Waypoint]) -> np.ndarray:

@@ -11,6 +11,7 @@ import itertools
 import math
 from contextlib import redirect_stdout
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import osqp
@@ -44,8 +45,23 @@ _CORRIDOR_SIDES = 8
 """Number of sides of the prism, inside the cylinder, that represents a corridor."""
 
 
+class Place(NamedTuple):
+    """Where a path does not meet a request, in words, and the index of the piece; None for a place that is on no piece."""
+
+    words: str
+    piece: int | None = None
+
+
 class InfeasibleError(ValueError):
-    """No trajectory meets the request; the message says which limit, and where."""
+    """No trajectory meets the request; the message says which limit, and where.
+
+    Attributes:
+        piece: index of the piece that does not meet it, the one from waypoint `piece` to the next; None where it is no single one.
+    """
+
+    def __init__(self, message: str, piece: int | None = None) -> None:
+        super().__init__(message)
+        self.piece = piece
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,18 +188,24 @@ def crests(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return at + 0.5 * slope * offset, np.arange(1, values.shape[-1] - 1) + offset
 
 
-def worst(limits: list[Plane], coefficients: np.ndarray, durations: np.ndarray) -> tuple[float, str]:
-    """Largest ratio of any limited quantity to its limit, and a description of it; (0, "") without limits."""
+def worst(limits: list[Plane], coefficients: np.ndarray, durations: np.ndarray) -> tuple[float, Place]:
+    """Largest ratio of any limited quantity to its limit, and that limit and its place in words; 0 without limits."""
     if not limits:
-        return 0.0, ""
+        return 0.0, Place("")
     excess, where = _Table.of(limits).excess(coefficients, durations)
     k = int(np.argmax(excess))
-    return float(excess[k]), _sentence(limits[k], float(where[k]), durations)
+    return float(excess[k]), _limit_at(limits[k], float(where[k]), durations)
 
 
-def _sentence(plane: Plane, u: float, durations: np.ndarray) -> str:
-    time = float(durations[: plane.piece].sum() + u * durations[plane.piece])
-    return f"{plane.name} between waypoints {plane.piece} and {plane.piece + 1}, at {time:.2f} s"
+def place_on(piece: int, time_s: float) -> Place:
+    """The place on a piece at `time_s` since the start of the path."""
+    return Place(f"between waypoints {piece} and {piece + 1}, at {time_s:.2f} s", piece)
+
+
+def _limit_at(plane: Plane, u: float, durations: np.ndarray) -> Place:
+    """A limit at the share `u` of its piece."""
+    place = place_on(plane.piece, float(durations[: plane.piece].sum() + u * durations[plane.piece]))
+    return place._replace(words=f"{plane.name} {place.words}")
 
 
 def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.ndarray) -> np.ndarray:
@@ -200,7 +222,8 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
     """
     if knots.fixed.all():
         _, what = worst(limits, system.coefficients(knots.value, start), system.durations)
-        raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s that stops at every waypoint keeps the {what}")
+        message = f"no trajectory in {system.durations.sum():.2f} s that stops at every waypoint keeps the {what.words}"
+        raise InfeasibleError(message, what.piece)
     table = _Table.of(limits)
     problem = _Problem(system, knots, start)
     index = np.repeat(np.arange(len(limits)), _FIRST_POINTS)
@@ -211,10 +234,11 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
         except (osqp.OSQPException, _GaveUpError) as error:
             _, what = worst(limits, system.coefficients(knots.value, start), system.durations)
             why = "" if isinstance(error, _GaveUpError) else "error "
-            raise InfeasibleError(f"no trajectory was found that keeps the {what}: OSQP gave up with {why}{error}") from None
+            message = f"no trajectory was found that keeps the {what.words}: OSQP gave up with {why}{error}"
+            raise InfeasibleError(message, what.piece) from None
         if conflict >= 0:
-            what = _sentence(limits[index[conflict]], float(where[conflict]), system.durations)
-            raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s keeps the {what}")
+            what = _limit_at(limits[index[conflict]], float(where[conflict]), system.durations)
+            raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s keeps the {what.words}", what.piece)
         excess, crest = table.excess(system.coefficients(knots.value, unknown), system.durations)
         broken = np.flatnonzero(excess > 1.0)
         if not len(broken):
@@ -222,8 +246,8 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
         index = np.concatenate([index, broken])
         where = np.concatenate([where, crest[broken]])
     k = int(np.argmax(excess))
-    what = _sentence(limits[k], float(crest[k]), system.durations)
-    raise InfeasibleError(f"no trajectory was found in {_ROUNDS} rounds that keeps the {what}")
+    what = _limit_at(limits[k], float(crest[k]), system.durations)
+    raise InfeasibleError(f"no trajectory was found in {_ROUNDS} rounds that keeps the {what.words}", what.piece)
 
 
 class _GaveUpError(Exception):

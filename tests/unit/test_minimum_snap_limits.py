@@ -120,8 +120,10 @@ def test_corridor_holds_between_waypoints() -> None:
 def test_request_that_cannot_be_met_says_which_limit_and_where(limits: Limits, message: str) -> None:
     points = np.array([[0, 0, 0], [1, 0, 0.3], [1, 1, 0], [0, 1, 0.3]], dtype=float)
     waypoints = [Waypoint(p, rotations.from_euler(0, 0, 0.5 * k)) for k, p in enumerate(points)]
-    with pytest.raises(InfeasibleError, match=message):
+    with pytest.raises(InfeasibleError, match=message) as refused:
         plan(waypoints, [5.0, 5.0, 5.0], limits, stretch=False)
+    piece = refused.value.piece
+    assert piece is not None and f"between waypoints {piece} and {piece + 1}, at " in str(refused.value)
 
 
 def test_time_is_stretched_no_more_than_the_limit_asks() -> None:
@@ -140,8 +142,9 @@ STOPS = [Waypoint(np.array(p, dtype=float), stop=True) for p in ((0, 0, 0), (1, 
 
 def test_path_that_stops_at_every_waypoint_says_which_limit_it_cannot_keep() -> None:
     message = r"no trajectory in 4.00 s that stops at every waypoint keeps the velocity along [xy] within 0.4 m/s between waypoints"
-    with pytest.raises(InfeasibleError, match=message):
+    with pytest.raises(InfeasibleError, match=message) as refused:
         plan(STOPS, 4.0, Limits(velocity=np.full(3, 0.4), corridor_m=0.1), stretch=False)
+    assert f"between waypoints {refused.value.piece} and" in str(refused.value)
 
 
 @pytest.mark.parametrize("seed", [3, 9, 11, 17, 19])
