@@ -136,7 +136,7 @@ class Task:
     frequency: np.ndarray = quantity([1, 2, 1], low=0, high=100, shape=(3,), help="lissajous: frequency along each axis")
     yaw_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of yaw per turn of u")
     roll_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of roll per turn of u")
-    file: str = quantity("", help="waypoints: CSV or TOML file (prepare/waypoints.py), relative to the scenario's folder")
+    file: str = quantity("", help="waypoints: CSV or TOML file (prepare/waypoints.py), beside the scenario's file; once read: its path")
     file_text: str = quantity("", help="text of `file`, read with the scenario, which can then be flown without the file")
     centre_m: np.ndarray = quantity(
         [0, 0, 0],
@@ -323,4 +323,4 @@ def _with_file_text(scenario: Scenario, folder: Path, source: Source) -> Scenari
         text = read_text(path)
     except DescriptionError as error:
         raise source.error(("task", "file"), str(error)) from None
-    return dataclasses.replace(scenario, task=dataclasses.replace(scenario.task, file_text=text))
+    return dataclasses.replace(scenario, task=dataclasses.replace(scenario.task, file=str(path), file_text=text))

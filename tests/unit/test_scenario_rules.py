@@ -336,7 +336,7 @@ def test_path_that_does_not_fit_is_refused_before_the_flight(tmp_path: Path, nam
     with pytest.raises(DescriptionError) as refused:
         flown(scenario)
     assert refusal in str(refused.value)
-    assert str(refused.value).startswith(name)
+    assert str(refused.value).startswith(f"{tmp_path / name}:")
     assert "\n" not in str(refused.value)
 
 
