@@ -19,11 +19,11 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.bench import fly_scenario
 from hil.fault_table import AT_S, NUMBER, PLACED, ROWS, Row
-from hil.flight import LOGS
+from hil.flight import LOGS, flight_of
 from hil.metrics import errors
 from hil.replaceable import check_replaceable, created_folder, is_json_with
 from hil.scenario import MODES, Scenario, load_scenario
-from hil.signals import Flight, read_flight
+from hil.signals import Flight
 from hil.workers import Pool
 
 SCENARIO = "faults"
@@ -63,7 +63,7 @@ def fly_cell(row: Row, mode: str, seed: int, parameters: Parameters | None = Non
     scenario = scenario_of(row, mode)
     with tempfile.TemporaryDirectory() as folder:
         fly_scenario(scenario, seed, parameters or Parameters(), Path(folder), f"virtual:{row.name}-{mode}-{seed}")
-        flight = read_flight(Path(folder))
+        flight = flight_of(scenario, Path(folder))
     return judge(row, mode, flight, load_vehicle(scenario.module[0].vehicle))
 
 

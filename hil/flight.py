@@ -121,7 +121,7 @@ def judge_logs(
         wall_s: wall time of the whole run.
         lost_share: share of the ticks that may be missing from a log.
     """
-    whole = dataclasses.replace(read_flight(folder), passive=passive_in(scenario))
+    whole = flight_of(scenario, folder)
     period_ns, begin_ns = period_of(whole.ticks), begin_of(scenario, whole)
     flight = whole.between(begin_ns, begin_ns + scenario.task.duration_ns)
     share = len(flight.firmware["tick"]) / len(whole.firmware["tick"])
@@ -167,6 +167,11 @@ def _armed_at_all(scenario: Scenario, whole: Flight, folder: Path) -> list[Limit
         if any(np.isin(columns["state"], list(ARMED)).any() for columns in bodies):
             return []
     return [Limit("armed_share", low=ARMED_AT_ALL)]
+
+
+def flight_of(scenario: Scenario, folder: Path) -> Flight:
+    """The flight of `scenario` whose logs are in `folder`, with the axes that its body leaves to buoyancy."""
+    return dataclasses.replace(read_flight(folder), passive=passive_in(scenario))
 
 
 def passive_in(scenario: Scenario) -> tuple[int, ...]:
@@ -223,7 +228,7 @@ def start_of(flight: Flight) -> int:
 def illustrate(scenario: Scenario, result: Result, folder: Path) -> Path:
     """Writes plots and report.html of the run in `folder`; returns the report's path."""
     scenario = scenario.for_seed(result.seed)
-    flight = as_wanted(scenario, dataclasses.replace(read_flight(folder), passive=passive_in(scenario)))
+    flight = as_wanted(scenario, flight_of(scenario, folder))
     scene = _scene(scenario, flight)
     numbers = [module.number for module in scenario.module]
     plots = write_plots(flight, folder, scene.window, scene.tank_m, scene.force_limits_n, scene.paper_rmse_mm, numbers, scene.tank)

@@ -23,13 +23,13 @@ from firmware_py.core.types import Action, Inputs, Mode, Outputs, Request, Stick
 from firmware_py.description.parameters import Parameters
 from hil.bench import fly_scenario, open_bench
 from hil.fault_table import SINGLE_FAULTS
-from hil.flight import wanted_in
+from hil.flight import flight_of, wanted_in
 from hil.metrics import Poses, errors, flight_metrics, rms
 from hil.orders import Orders
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
 from hil.scenario import MODES, Scenario, load_scenario
-from hil.signals import Flight, read_flight
+from hil.signals import Flight
 
 BREAKS_AFTER_S = 10.0
 """Time from the start of the spiral to the fault."""
@@ -42,7 +42,7 @@ def flown(scenario: Scenario, seed: int, parameters: Parameters | None = None, r
     """Flies a scenario and returns the flight; its logs are discarded."""
     with tempfile.TemporaryDirectory() as folder:
         fly_scenario(scenario, seed, parameters or Parameters(), Path(folder), f"virtual:{Path(folder).name}", rate_hz)
-        return read_flight(Path(folder))
+        return flight_of(scenario, Path(folder))
 
 
 def in_task(scenario: Scenario, flight: Flight) -> tuple[Flight, Poses]:

@@ -92,7 +92,7 @@ class Response(NamedTuple):
     off_line_share: float = 0.0
     """Share of the controller's output outside the excitation frequencies: large in a loop that oscillates by itself."""
     controlled: bool = True
-    """Whether the thrusters can push along the axis."""
+    """Whether the thrusters can push along the axis, and it is not left to buoyancy."""
 
 
 class Loop:
@@ -181,8 +181,10 @@ def _world(body: Body, vehicles: Sequence[Vehicle], lag_s: float) -> World:
 
 
 def controlled(body: Body) -> np.ndarray:
-    """(6,) whether the thrusters can push along each axis."""
-    return np.asarray(np.diag(body.thrusters.matrix @ body.thrusters.pinv) >= MIN_CONTROLLED_SHARE)
+    """(6,) whether the thrusters can push along each axis, and it is not left to buoyancy."""
+    pushed = np.diag(body.thrusters.matrix @ body.thrusters.pinv) >= MIN_CONTROLLED_SHARE
+    pushed[list(body.passive)] = False
+    return np.asarray(pushed)
 
 
 def lines() -> np.ndarray:

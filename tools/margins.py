@@ -4,8 +4,8 @@
 .venv/bin/python tools/margins.py --controller runs/tune/parameters.toml --modules 1
 .venv/bin/python tools/margins.py --vehicle bluerov2_heavy --modules 1 --out runs/margins
 
-Status 1 where a margin is below its limit, or a controlled axis oscillates or never crosses 0 dB. An axis that the thrusters cannot push is
-named and does not count. In DIR: margins.json and margins.png, the Bode plot.
+Status 1 where a margin is below its limit, or a controlled axis oscillates or never crosses 0 dB. An axis that the thrusters cannot push,
+or that the vehicle leaves to buoyancy, is named and does not count. In DIR: margins.json and margins.png, the Bode plot.
 """
 
 from __future__ import annotations

@@ -9,8 +9,10 @@ import pytest
 
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Mode
-from hil.fault_campaign import judge
+from hil import fault_campaign, flight
+from hil.fault_campaign import fly_cell, judge
 from hil.fault_table import AT_S, ROWS
+from hil.scenario import load_scenario
 from hil.signals import Flight
 
 TICKS, PERIOD_NS = 2000, 10_000_000
@@ -98,3 +100,16 @@ def test_promise_that_is_kept_is_not_broken() -> None:
 )
 def test_promise_that_was_broken_is_named(row: str, change: Change, words: str) -> None:
     assert words in broken(row, change)
+
+
+@pytest.mark.parametrize(("vehicle", "words"), [("bluerov2", ()), ("modcube", ("60 deg off",))])
+def test_rotation_that_the_vehicle_leaves_to_buoyancy_breaks_no_promise(
+    monkeypatch: pytest.MonkeyPatch, vehicle: str, words: tuple[str, ...]
+) -> None:
+    """A BlueROV2 declares its pitch passive."""
+    pitched = held()
+    pitched.truth["q_wb"][:] = [math.cos(math.radians(30.0)), 0.0, math.sin(math.radians(30.0)), 0.0]
+    monkeypatch.setattr(flight, "read_flight", lambda folder: pitched)
+    monkeypatch.setattr(fault_campaign, "fly_scenario", lambda *_: None)
+    monkeypatch.setattr(fault_campaign, "scenario_of", lambda row, mode: load_scenario("hover").with_vehicle(vehicle))
+    assert fly_cell(BY_NAME[HALF_FORCE], "POSHOLD", 0).broken == words

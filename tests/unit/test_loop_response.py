@@ -1,6 +1,7 @@
 """The measured open loop against the closed loop that it predicts, and margins of loops with known ones."""
 
 import importlib
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,8 @@ from matplotlib import pyplot
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import AXES
+from firmware_py.description.toml_text import to_toml
+from firmware_py.description.vehicle import AXES, load_vehicle
 
 SURGE = 0
 
@@ -47,6 +49,13 @@ def test_loop_that_crosses_nowhere_has_no_margins_to_state(gain: float) -> None:
 def test_axis_that_no_thruster_pushes_is_not_controlled() -> None:
     assert [name for name, pushed in zip(AXES, controlled(body_of(1, "bluerov2")), strict=True) if not pushed] == ["pitch"]
     assert controlled(body_of(1, "bluerov2_heavy")).all() and controlled(body_of(2, "modcube")).all()
+
+
+def test_axis_that_a_vehicle_leaves_to_buoyancy_is_not_controlled(tmp_path: Path) -> None:
+    """Its thrusters could push it, but are never asked to."""
+    own = tmp_path / "own.toml"
+    own.write_text(to_toml(load_vehicle("bluerov2_heavy")).replace("passive_dof = []", 'passive_dof = ["roll"]'), encoding="utf-8")
+    assert [name for name, pushed in zip(AXES, controlled(body_of(1, str(own))), strict=True) if not pushed] == ["roll"]
 
 
 def judged(pitch: Response) -> list[dict[str, Any]]:
