@@ -18,7 +18,7 @@ from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.bench import fly_scenario
-from hil.fault_table import AT_S, NUMBER, PLACED, ROWS, Row
+from hil.fault_table import AT_S, NAME, PLACED, ROWS, Row
 from hil.flight import LOGS, flight_of
 from hil.metrics import errors
 from hil.replaceable import check_replaceable, created_folder, is_json_with
@@ -30,7 +30,7 @@ SCENARIO = "faults"
 RESULT_FILE = "faults.json"
 LEAD_S = 0.015
 """Includes the tick before the fault, so that an immediate change is seen as a change."""
-BLAMED = re.compile(r"thruster (\d+) ")
+BLAMED = re.compile(r"thruster \d+ of module \d+")
 """Thruster named in an event, as it is when one is left out."""
 SETTLE_TICKS = 300
 """Time for the body to come to rest after a mode outside PLACED."""
@@ -78,7 +78,7 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Vehicle) -> Cell:
     told = _told(flight)
     said_s = [at_s for text, at_s in told if row.says and row.says in text]
     error_m, angle_deg = worst_errors(after, names)
-    blamed = {f"thruster {found[1]}" for text, _ in told for found in BLAMED.finditer(text)} - ({NUMBER} if row.leaves_out else set())
+    blamed = {found[0] for text, _ in told for found in BLAMED.finditer(text)} - ({NAME} if row.leaves_out else set())
     broken = {
         f"was in {names[0]} when it began": names[0] != mode,
         f"left {mode} for {next((name for name in names if name != mode), '')}": wanted == mode and bool(changes),

@@ -20,7 +20,8 @@ THRUSTER = 5
 PILOTED = ("MANUAL", "STABILIZE", "ALT_HOLD")
 PLACED = ("POSHOLD", "AUTO", "GUIDED")
 """Modes that hold a position or follow one."""
-NUMBER = f"thruster {THRUSTER + 1}"
+NAME = f"thruster {THRUSTER + 1} of module 0"
+"""Its name in the firmware's texts; the scenario has one module."""
 
 
 def _all_but(*modes: str) -> tuple[str, ...]:
@@ -55,7 +56,7 @@ class Row:
     @property
     def leaves_out(self) -> bool:
         """Whether the broken thruster must be left out from then on."""
-        return NUMBER in self.says
+        return NAME in self.says
 
 
 def _fault(kind: str, value: float = 0.0, **more: float | str) -> Fault:
@@ -69,20 +70,20 @@ def _to(mode: str, *modes: str) -> dict[str, str]:
 ROWS = (
     Row(
         "thruster dead", "left out; 60 mm, 15 deg", _fault("thruster_dead", index=THRUSTER),
-        error_m=0.060, angle_deg=15.0, says=f"{NUMBER} stands still",
+        error_m=0.060, angle_deg=15.0, says=f"{NAME} stands still",
     ),
     Row("thruster at half force", "flown with; 60 mm, 15 deg", _fault("thruster_weak", 0.5, index=THRUSTER), error_m=0.060, angle_deg=15.0),
     Row(
         "thruster reversed", "left out; 60 mm, 15 deg", _fault("thruster_reversed", index=THRUSTER),
-        error_m=0.060, angle_deg=15.0, says=f"{NUMBER} does not",
+        error_m=0.060, angle_deg=15.0, says=f"{NAME} does not",
     ),
     Row(
         "thruster stuck at half", "left out; 100 mm, 20 deg", _fault("thruster_stuck", 0.5, index=THRUSTER),
-        error_m=0.100, angle_deg=20.0, says=f"{NUMBER} does not obey", says_in=_all_but("MANUAL"),
+        error_m=0.100, angle_deg=20.0, says=f"{NAME} does not obey", says_in=_all_but("MANUAL"),
     ),
     Row(
         "thruster fakes its rpm", "left out; 60 mm, 15 deg", _fault("thruster_fake_rpm", 0.0, index=THRUSTER),
-        error_m=0.060, angle_deg=15.0, says=f"{NUMBER} does not push as it says", says_in=_all_but("MANUAL", "MOTOR_DETECT"),
+        error_m=0.060, angle_deg=15.0, says=f"{NAME} does not push as it says", says_in=_all_but("MANUAL", "MOTOR_DETECT"),
     ),
     Row("30 % of the frames lost", "as before; 30 mm", _fault("frame_loss", 0.3), error_m=0.030),
     Row("frames 20 ms late", "as before; 30 mm", _fault("frame_delay", 20.0), error_m=0.030),

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from firmware_py.core.alignment import AGREE_S
 from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
+from firmware_py.core.thruster_names import listed
 from firmware_py.core.transitions import MODES, Need
 from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters, contradictions, invalid
@@ -86,8 +87,8 @@ def _sticks(q: Question) -> str:
     return ""
 
 
-def _escs(q: Question) -> str:
-    return f"ESC {', '.join(str(i + 1) for i in q.health.esc_missing)} does not answer" if q.health.esc_missing else ""
+def _escs(q: Question) -> list[str]:
+    return [f"ESC {escs} does not answer" for escs in listed(q.health.esc_missing)]
 
 
 def _thrusters(q: Question) -> list[str]:

@@ -18,6 +18,7 @@ from firmware_py.core.body import Body, rank_by, rank_of
 from firmware_py.core.missing_thrust import MissingThrust
 from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import polynomial
+from firmware_py.core.thruster_names import name_of, places_of
 from firmware_py.core.topology import in_both
 from firmware_py.core.types import Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
@@ -95,6 +96,7 @@ class FaultDetector:
         self._thruster_at = by_channel(body)
         self._pairs = [{c: (at.get(c, -1), at.get(c + 1, -1)) for c in range(max(at) + 1)} for at in self._thruster_at]
         self._modules = body.modules
+        self._names = tuple(map(name_of, places_of(body)))
         full_n = np.array([(polynomial(f, 1.0), polynomial(r, 1.0)) for f, r in zip(t.forward, t.reverse, strict=True)])
         self._believed = (full_n, t.rpm_at_full)
         self._motion = MissingThrust(body, parameters, period_ns)
@@ -229,7 +231,7 @@ class FaultDetector:
         most = FAST_SHARE * abs(self.believed_rpm(i, force_n[i])) + FAST_MARGIN * self._believed[1][i]
         self._counts[i, WRONG_SPEED] = self._counts[i, WRONG_SPEED] + 1 if abs(rpm) > most else 0
         if self._counts[i, WRONG_SPEED] == self._needed[WRONG_SPEED]:
-            self.words.append(f"thruster {i + 1} turns though it was told to stand still")
+            self.words.append(f"{self._names[i]} turns though it was told to stand still")
 
     def believed_rpm(self, i: int, force_n: float) -> float:
         """Returns the speed of thruster `i` at a force, 1/min."""
@@ -240,14 +242,14 @@ class FaultDetector:
         self._obeys[i] = False
         self.now, self.changed = self._usable_state(), True
         self._motion.forget()
-        self.words.append(f"thruster {i + 1} {why}: left out")
+        self.words.append(f"{self._names[i]} {why}: left out")
 
     def _take_back(self, i: int) -> None:
         """Uses a thruster again that the motion alone had convicted."""
         self._obeys[i] = True
         self.now, self.changed = self._usable_state(), True
         self._motion.forget()
-        self.words.append(f"thruster {i + 1} is used again: the robot is pushed as much without it")
+        self.words.append(f"{self._names[i]} is used again: the robot is pushed as much without it")
 
     def _state_for(self, usable: np.ndarray) -> ThrusterFaults:
         alive = usable.copy()

@@ -15,6 +15,7 @@ import numpy as np
 from firmware_py.core.body import Body, axes_without_thrust
 from firmware_py.core.faults import ESC_DOWN, ThrusterFaults, by_channel
 from firmware_py.core.rotations import rotate
+from firmware_py.core.thruster_names import Place, places_of
 from firmware_py.core.types import MCU_ESTOP, MCU_UNFIT, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
@@ -75,8 +76,8 @@ class Health(NamedTuple):
     bus_silent_s: float
     """Shortest present silence of any module, or the time without a tick before this one if that is longer: a process that was stopped has
     heard nobody meanwhile, whatever it finds when it goes on."""
-    esc_missing: tuple[int, ...]
-    """Indices of thrusters whose ESC does not answer, or reports a fault."""
+    esc_missing: tuple[Place, ...]
+    """Places of thrusters whose ESC does not answer, or reports a fault."""
     frame_errors_per_s: float
     missed_ticks_per_s: float
     foreign_sync: bool
@@ -171,7 +172,8 @@ class HealthMonitor:
         self._drag = body.drag.mean, float(body.drag.linear[:3].mean())
         self._thruster_at = dict(zip(body.modules, by_channel(body), strict=True))
         self._without_thrust = tuple(AXES[axis] for axis in axes_without_thrust(body.thrusters.matrix, body.passive))
-        self._esc_ns = [NEVER_NS] * body.thrusters.module.size
+        self._places = places_of(body)
+        self._esc_ns = [NEVER_NS] * len(self._places)
         never = dict.fromkeys(body.modules, NEVER_NS)
         self._heard_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns = (never.copy() for _ in range(5))
         self._unfit, self._leak, self._wet = (dict.fromkeys(body.modules, False) for _ in range(3))
@@ -260,7 +262,7 @@ class HealthMonitor:
             silent=tuple([m for m, at in self._answered_ns.items() if now - at > self._answer_ns]),
             silent_s=(now - min(self._heard_ns.values())) * 1e-9,
             bus_silent_s=max(now - max(self._heard_ns.values()), stopped_ns) * 1e-9,
-            esc_missing=_older(self._esc_ns, now - self._esc_fresh_ns),
+            esc_missing=tuple([self._places[i] for i in _older(self._esc_ns, now - self._esc_fresh_ns)]),
             frame_errors_per_s=latest.error_rate,
             missed_ticks_per_s=latest.missed_rate,
             foreign_sync=now - latest.foreign_sync_ns <= FOREIGN_NS,

@@ -12,6 +12,7 @@ from firmware_py.core.arming import CHECKS, Question, against_arming, missing
 from firmware_py.core.body import axes_without_thrust
 from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
+from firmware_py.core.thruster_names import Place
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode, Request
 from firmware_py.description.failsafe_parameters import Fence
@@ -58,7 +59,7 @@ SOFT: list[tuple[Health, str]] = [
     (GOOD._replace(cabin_age_s=NEVER_S), "cabin was not heard of lately"),
     (GOOD._replace(nis_ratio=6.0), "sensors and model disagree: 6.0 of the expected, 5.0 permitted"),
     (GOOD._replace(unfit=(0, 2)), "module 0, 2 starts, or has a fault"),
-    (GOOD._replace(esc_missing=(0, 7)), "ESC 1, 8 does not answer"),
+    (GOOD._replace(esc_missing=(Place(0, 0), Place(0, 7))), "ESC 1, 8 of module 0 does not answer"),
     (GOOD._replace(lost_axes=1), "the thrusters left cannot make every wrench"),
     (GOOD._replace(without_thrust=("pitch",)), "pitch has no thrust: declare it in passive_dof of the vehicle file, or add thrusters"),
     (GOOD._replace(frame_errors_per_s=21.0), "21 bad frames a second, 20 permitted"),

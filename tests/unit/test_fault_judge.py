@@ -11,7 +11,7 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import Mode
 from hil import fault_campaign, flight
 from hil.fault_campaign import fly_cell, judge
-from hil.fault_table import AT_S, ROWS
+from hil.fault_table import AT_S, NAME, ROWS
 from hil.scenario import load_scenario
 from hil.signals import Flight
 
@@ -89,10 +89,10 @@ def test_promise_that_is_kept_is_not_broken() -> None:
         (AS_BEFORE, after(5.0, "setpoint_p_wb", math.nan), "inf mm off"),
         (HALF_FORCE, after(5.0, "q_wb", [0.5, 0.5, 0.5, 0.5]), "120 deg off"),
         (HALF_FORCE, after(5.0, "q_wb", math.nan), "inf deg off"),
-        (HALF_FORCE, said("thruster 6 stands still: left out"), "blamed thruster 6"),
-        (AS_BEFORE, said("thruster 2 does not obey: left out"), "blamed thruster 2"),
-        ("thruster dead", said("thruster 6 stands still: left out, and thruster 3 does not obey"), "blamed thruster 3"),
-        ("thruster dead", lambda flight: None, "did not say 'thruster 6 stands still'"),
+        (HALF_FORCE, said("thruster 6 of module 0 stands still: left out"), "blamed thruster 6 of module 0"),
+        (AS_BEFORE, said("thruster 2 of module 0 does not obey: left out"), "blamed thruster 2 of module 0"),
+        ("thruster dead", said(f"{NAME} stands still, thruster 3 of module 0 does not obey"), "blamed thruster 3 of module 0"),
+        ("thruster dead", lambda flight: None, "did not say 'thruster 6 of module 0 stands still'"),
         (AS_BEFORE, after(5.0, "commanded_n", math.nan), "a command was no number"),
         (AS_BEFORE, after(5.0, "commanded_n", 5.1), "a command was beyond its limits"),
         (AS_BEFORE, after(5.0, "commanded_n", -4.1), "a command was beyond its limits"),

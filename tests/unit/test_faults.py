@@ -18,7 +18,7 @@ def test_thruster_that_stands_still_is_found_within_half_a_second(water: Water, 
     water.fly(1.0)
     water.gain[thruster] = water.speed_factor[thruster] = 0.0
     found = water.run(1.0)
-    assert [words for _, words in found] == [f"thruster {thruster + 1} stands still: left out"]
+    assert [words for _, words in found] == [f"thruster {thruster + 1} of module 0 stands still: left out"]
     assert found[0][0] <= 0.5
     assert water.detector.now.dead == (thruster,) and not water.detector.now.alive[thruster]
     assert water.detector.now.lost_axes == 0
@@ -33,7 +33,7 @@ def test_thruster_dead_from_the_start_is_found_within_half_a_second_of_the_first
     while not found:
         found = water.run(DT)
         pushing += DT * (abs(water.believed.force_n[thruster]) > 0.3)
-    assert [words for _, words in found] == [f"thruster {thruster + 1} stands still: left out"]
+    assert [words for _, words in found] == [f"thruster {thruster + 1} of module 0 stands still: left out"]
     assert pushing <= 0.5, "the others steer it through zero at times"
 
 
@@ -42,7 +42,7 @@ def test_esc_that_reports_a_failure_is_believed(water: Water, status: int) -> No
     water.fly(0.5)
     water.status[6] = status
     found = water.run(1.0)
-    assert found[0][0] <= 0.41 and found[0][1] == "thruster 7 has an ESC that failed: left out"
+    assert found[0][0] <= 0.41 and found[0][1] == "thruster 7 of module 0 has an ESC that failed: left out"
 
 
 def test_three_reports_of_a_failed_esc_in_a_row_are_enough_and_two_are_not(water: Water) -> None:
@@ -52,7 +52,7 @@ def test_three_reports_of_a_failed_esc_in_a_row_are_enough_and_two_are_not(water
         water.status[6] = status
         assert water.run(seconds) == []
     water.status[6] = 1
-    assert [words for _, words in water.run(0.3)] == ["thruster 7 has an ESC that failed: left out"]
+    assert [words for _, words in water.run(0.3)] == ["thruster 7 of module 0 has an ESC that failed: left out"]
 
 
 def test_hot_esc_is_no_failure(water: Water) -> None:
@@ -65,7 +65,7 @@ def test_thruster_that_turns_the_wrong_way_or_races_is_found(water: Water, facto
     water.fly(0.5)
     water.speed_factor[3] = factor
     found = water.run(1.0, 2.0 * PUSH)
-    assert found[0][1] == "thruster 4 does not obey: left out" and found[0][0] <= 0.6
+    assert found[0][1] == "thruster 4 of module 0 does not obey: left out" and found[0][0] <= 0.6
 
 
 @pytest.mark.parametrize("factor", [-1.0, 4.0])
@@ -77,7 +77,7 @@ def test_two_feedbacks_of_a_disobedient_thruster_are_enough_and_one_is_not(water
     water.speed_factor[3] = 1.0
     assert water.run(1.0, 2.0 * PUSH) == []
     water.speed_factor[3] = factor
-    assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == ["thruster 4 does not obey: left out"]
+    assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == ["thruster 4 of module 0 does not obey: left out"]
 
 
 def test_two_feedbacks_of_a_clear_standstill_are_enough_and_one_is_not(water: Water) -> None:
@@ -89,7 +89,7 @@ def test_two_feedbacks_of_a_clear_standstill_are_enough_and_one_is_not(water: Wa
     water.speed_factor[busy] = 1.0
     assert water.run(1.0, 2.0 * PUSH) == []
     water.speed_factor[busy] = 0.0
-    assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == [f"thruster {busy + 1} stands still: left out"]
+    assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == [f"thruster {busy + 1} of module 0 stands still: left out"]
 
 
 @pytest.mark.parametrize("thruster", range(8))
@@ -114,7 +114,7 @@ def test_propeller_that_turns_on_a_disarmed_robot_is_told_of_once_and_anew_when_
     water.fly(1.0)
     assert water.run(1.0, armed=False) == [], "they only run down"
     water.stray_rpm[2] = -0.4 * BODY.thrusters.rpm_at_full[2]
-    assert [words for _, words in water.run(1.0, armed=False)] == ["thruster 3 turns though it was told to stand still"]
+    assert [words for _, words in water.run(1.0, armed=False)] == ["thruster 3 of module 0 turns though it was told to stand still"]
     assert water.detector.now.alive.all(), "it is trusted again when it is armed, and judged then"
     water.stray_rpm[2] = 0.0
     assert water.run(1.0, armed=False) == []
@@ -126,7 +126,7 @@ def test_dead_thruster_is_found_although_frames_are_lost(water: Water) -> None:
     water.heard = 0.7
     water.fly(2.0)
     water.gain[2] = water.speed_factor[2] = 0.0
-    assert water.run(1.5)[0][1].startswith("thruster 3 ")
+    assert water.run(1.5)[0][1].startswith("thruster 3 of module 0 ")
 
 
 def test_robot_that_is_armed_anew_trusts_its_thrusters_again(water: Water) -> None:

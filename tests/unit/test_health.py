@@ -12,6 +12,7 @@ from firmware_py.core.faults import ThrusterFaults
 from firmware_py.core.health import NEVER_S, Health, HealthMonitor, outside
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import exp
+from firmware_py.core.thruster_names import Place
 from firmware_py.core.types import Action, BodyPose, EscFeedback, Estimate, Inputs, Measured, ModuleInputs, Request, Sticks, TagObservation
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
@@ -21,6 +22,7 @@ from firmware_py.prepare.assembly import assemble
 TICK_NS = 10_000_000
 START_NS = 3600 * 10**9
 BODY = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2, [1, 3])
+EVERY = tuple(Place(module, channel) for module in (1, 3) for channel in range(8))
 SINGLE = assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [1])
 ZERO = np.zeros(3)
 
@@ -214,7 +216,7 @@ def test_body_that_takes_over_knows_what_its_modules_said_and_when_people_were_h
     assert after.voltage_share == pytest.approx(0.95)
     assert after.silent_s == after.depth_age_s == pytest.approx(0.51)
     assert after.ground_age_s == after.pilot_age_s == pytest.approx(0.52) and after.stick == 0.5
-    assert 6 not in after.esc_missing and 5 in after.esc_missing
+    assert Place(3, 6) not in after.esc_missing and Place(3, 5) in after.esc_missing
     assert after.frame_errors_per_s == pytest.approx(before.frame_errors_per_s, rel=0.02), "no frame counts twice"
     pair = MonitorBench()
     pair.monitor.take_over([whole.monitor, alone.monitor])
@@ -242,12 +244,12 @@ def test_fence_and_delays_may_change() -> None:
 
 def test_esc_that_fails_or_falls_silent_is_missing() -> None:
     bench = MonitorBench()
-    assert bench.step().esc_missing == tuple(range(16))
+    assert bench.step().esc_missing == EVERY
     good = [EscFeedback(i, (0.0, 0.0), (0.0, 0.0), (0, 2)) for i in range(0, 8, 2)]
     bad = [*good[:3], EscFeedback(6, (0.0, 0.0), (0.0, 0.0), (1, 3))]
-    assert bench.step(here(esc=good), here(esc=bad)).esc_missing == (14, 15)
-    assert bench.wait(1.0).esc_missing == (14, 15)
-    assert bench.step().esc_missing == tuple(range(16))
+    assert bench.step(here(esc=good), here(esc=bad)).esc_missing == (Place(3, 6), Place(3, 7))
+    assert bench.wait(1.0).esc_missing == (Place(3, 6), Place(3, 7))
+    assert bench.step().esc_missing == EVERY
 
 
 def test_ground_station_and_pilot_count_once_they_were_heard() -> None:

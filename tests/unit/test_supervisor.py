@@ -8,6 +8,7 @@ import pytest
 from firmware_py.core.failsafes import Level
 from firmware_py.core.joints import modules_of
 from firmware_py.core.supervisor import Decision, Supervisor
+from firmware_py.core.thruster_names import Place
 from firmware_py.core.transitions import ARMED, ROWS, TABLE, Effect, Guard, State, Transition, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Event, Mode, Request
 from tests.unit.healths import BLIND, GOOD, at
@@ -94,10 +95,10 @@ def test_same_reason_of_several_fail_safes_is_said_once() -> None:
 def test_force_is_the_word_true_alone() -> None:
     for argument in (False, 1, "yes", None):
         supervisor = supervisor_in(State.DISARMED)
-        assert ask(supervisor, Action.ARM, argument, GOOD._replace(esc_missing=(0,))) == []
-        assert texts(supervisor) == ["ARM refused: ESC 1 does not answer"]
+        assert ask(supervisor, Action.ARM, argument, GOOD._replace(esc_missing=(Place(0, 0),))) == []
+        assert texts(supervisor) == ["ARM refused: ESC 1 of module 0 does not answer"]
     supervisor = supervisor_in(State.DISARMED)
-    assert ask(supervisor, Action.ARM, True, GOOD._replace(esc_missing=(0,))) and supervisor.armed
+    assert ask(supervisor, Action.ARM, True, GOOD._replace(esc_missing=(Place(0, 0),))) and supervisor.armed
 
 
 def test_all_reasons_are_named_at_once() -> None:

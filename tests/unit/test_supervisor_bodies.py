@@ -5,6 +5,7 @@ import pytest
 from firmware_py.core.failsafes import Level
 from firmware_py.core.health import Health
 from firmware_py.core.supervisor import Supervisor
+from firmware_py.core.thruster_names import Place
 from firmware_py.core.transitions import State
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Mode, Request
 from tests.unit.healths import BLIND, GOOD, UPRIGHT, at
@@ -47,7 +48,7 @@ def test_robot_that_a_pilot_steers_is_steered_by_him_when_it_joins_or_parts(mode
 
 
 @pytest.mark.parametrize(("state", "mode", "health", "may"), [
-    (State.DISARMED, Mode.POSHOLD, GOOD, True), (State.DISARMED, Mode.POSHOLD, GOOD._replace(esc_missing=(3,)), False),
+    (State.DISARMED, Mode.POSHOLD, GOOD, True), (State.DISARMED, Mode.POSHOLD, GOOD._replace(esc_missing=(Place(0, 3),)), False),
     (State.DISARMED, Mode.POSHOLD, BLIND, False), (State.DISARMED, Mode.MANUAL, BLIND, True),
     (State.DISARMED, Mode.POSHOLD, UPRIGHT, False), (State.DISARMED, Mode.ALT_HOLD, UPRIGHT, True),
     (State.ARMED, Mode.POSHOLD, GOOD, False), (State.ESTOP, Mode.POSHOLD, GOOD, False),
