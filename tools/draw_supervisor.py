@@ -103,7 +103,7 @@ def failsafes() -> list[str]:
         limit = f"{'<' if row.below else '>'} {watch.limit:g}" if hasattr(parameters, f"{row.name}_limit") else "yes"
         delay = f"{getattr(parameters, f'{row.name}_delay_s'):g} s"
         ends = "disarming" if watch.latched else f"cause gone for {parameters.clear_s:g} s"
-        says = row.words.format(float("nan")).replace("nan", "N")
+        says = (row.words + row.detail).format(float("nan")).replace("nan", "N")
         rows.append((f"`{row.name}`", says, limit, delay, words(watch.level.name), ends, counts_in(row)))
     return table(("fail-safe", "text", "limit", "delay", "action", "ends by", "active in"), rows)
 

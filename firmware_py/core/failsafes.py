@@ -56,9 +56,11 @@ class Row(NamedTuple):
 
     name: str
     words: str
-    """Text for people; `{}` takes the value."""
+    """The cause, for people: the text of its end, and the beginning of every other."""
     figure: str
     """Name of the field of Health to watch. Without a limit parameter any value above zero is bad; True counts as 1."""
+    detail: str = ""
+    """Follows `words` while the cause lasts; `{}` takes the value. At its end the value would only tell that all is well again."""
     below: bool = False
     """Whether values below the limit, not above it, are bad."""
     modes: frozenset[Mode] = ANY
@@ -68,34 +70,35 @@ class Row(NamedTuple):
     """Further modes, in which it only warns, whatever its action."""
 
 
+LASTS = " for {:.1f} s"
 TABLE = (
     Row("leak", "water in a cabin", "leak"),
-    Row("bus_silent", "bus silent for {:.1f} s", "bus_silent_s"),
+    Row("bus_silent", "bus silent", "bus_silent_s", LASTS),
     Row("foreign_sync", "somebody else sends SYNC", "foreign_sync"),
     Row("foreign_command", "somebody else commands modules", "foreign_command"),
-    Row("battery_critical", "battery critical: {:.0%} of its voltage", "voltage_share", below=True),
-    Row("cabin_hot", "cabin at {:.0f} degC", "cabin_c"),
-    Row("cabin_pressure", "cabin pressure off by {:.0f} Pa", "cabin_change_pa"),
+    Row("battery_critical", "battery critical", "voltage_share", ": {:.0%} of its voltage", below=True),
+    Row("cabin_hot", "cabin hot", "cabin_c", ": {:.0f} degC"),
+    Row("cabin_pressure", "cabin pressure off", "cabin_change_pa", " by {:.0f} Pa"),
     Row("axis_lost", "the thrusters left cannot make every wrench", "lost_axes"),
-    Row("depth_unknown", "depth unknown for {:.1f} s", "depth_unknown_s", modes=PLACED | {Mode.ALT_HOLD}),
-    Row("tag_gone", "no tag for {:.1f} s", "tag_age_s", modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
+    Row("depth_unknown", "depth unknown", "depth_unknown_s", LASTS, modes=PLACED | {Mode.ALT_HOLD}),
+    Row("tag_gone", "no tag", "tag_age_s", LASTS, modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
     Row("partner_lost", "a docked partner is lost", "partner_lost"),
-    Row("estimator", "sensors and model disagree: {:.1f} of the expected", "nis_ratio", modes=PLACED, warned_modes=TRUSTING),
-    Row("rejected", "{:.0%} of the tags refused", "rejected_share", modes=PLACED, warned_modes=TRUSTING),
-    Row("tag_lost", "no tag for {:.1f} s", "tag_age_s", modes=PLACED),
-    Row("pushed", "pushed out of sight as by a current of {:.1f} m/s", "unseen_push_m_s", modes=FREE),
-    Row("tag_late", "no tag for {:.1f} s", "tag_age_s", modes=MOVING),
-    Row("depth_lost", "no pressure for {:.1f} s", "depth_age_s"),
-    Row("imu_lost", "no IMU for {:.1f} s", "imu_age_s"),
-    Row("module_silent", "a module is silent for {:.1f} s", "silent_s"),
-    Row("ticks_missed", "{:.0f} ticks missed in a second", "missed_ticks_per_s"),
-    Row("fence", "{:.2f} m outside the fence", "outside_m", modes=MOVING),
-    Row("ground_lost", "ground station silent for {:.1f} s", "ground_age_s", modes=ANY - {Mode.AUTO, Mode.SURFACE}),
-    Row("pilot_lost", "pilot silent for {:.1f} s", "pilot_age_s", modes=PILOTED),
+    Row("estimator", "sensors and model disagree", "nis_ratio", ": {:.1f} of the expected", modes=PLACED, warned_modes=TRUSTING),
+    Row("rejected", "tags refused", "rejected_share", ": {:.0%} of them", modes=PLACED, warned_modes=TRUSTING),
+    Row("tag_lost", "no tag", "tag_age_s", LASTS, modes=PLACED),
+    Row("pushed", "pushed out of sight", "unseen_push_m_s", " as by a current of {:.1f} m/s", modes=FREE),
+    Row("tag_late", "no tag", "tag_age_s", LASTS, modes=MOVING),
+    Row("depth_lost", "no pressure", "depth_age_s", LASTS),
+    Row("imu_lost", "no IMU", "imu_age_s", LASTS),
+    Row("module_silent", "a module is silent", "silent_s", LASTS),
+    Row("ticks_missed", "ticks missed", "missed_ticks_per_s", ": {:.0f} in a second"),
+    Row("fence", "outside the fence", "outside_m", " by {:.2f} m", modes=MOVING),
+    Row("ground_lost", "ground station silent", "ground_age_s", LASTS, modes=ANY - {Mode.AUTO, Mode.SURFACE}),
+    Row("pilot_lost", "pilot silent", "pilot_age_s", LASTS, modes=PILOTED),
     Row("thruster_lost", "a thruster is out", "thruster_lost"),
-    Row("cabin_unknown", "no reading of a cabin for {:.1f} s", "cabin_age_s"),
-    Row("battery_unknown", "no reading of a battery for {:.1f} s", "battery_age_s"),
-    Row("battery_low", "battery low: {:.0%} of its voltage", "voltage_share", below=True),
+    Row("cabin_unknown", "no reading of a cabin", "cabin_age_s", LASTS),
+    Row("battery_unknown", "no reading of a battery", "battery_age_s", LASTS),
+    Row("battery_low", "battery low", "voltage_share", ": {:.0%} of its voltage", below=True),
 )
 get_figures = attrgetter(*(row.figure for row in TABLE))
 """Returns the figure of every row, from the health of a tick."""
@@ -170,13 +173,14 @@ class Watch:
 
     def words(self, health: Health) -> str:
         """Returns its text with the present value."""
-        value, words = getattr(health, self.row.figure), self.row.words
-        return words.replace(" for {:.1f} s", "") if value >= NEVER_S else words.format(value)
+        value = getattr(health, self.row.figure)
+        return self.row.words if value >= NEVER_S else self.row.words + self.row.detail.format(value)
 
     def ending(self, health: Health, mode: Mode, armed: bool) -> str:
-        """Returns its text when it ends; says so where the cause persists but no longer counts in this mode or while disarmed."""
-        no_more = f", which does not count {f'in {mode.name}' if armed else 'while disarmed'}" if self.beyond(health) else ""
-        return self.words(health) + no_more
+        """Returns its text when it ends: what has cleared; or that the cause lasts but no longer counts in this mode or while disarmed."""
+        if not self.beyond(health):
+            return self.row.words
+        return f"{self.words(health)}, which does not count {f'in {mode.name}' if armed else 'while disarmed'}"
 
     def reason(self, health: Health) -> str:
         """Returns what is wrong, for people; the text from when it began if its cause is gone."""

@@ -90,7 +90,7 @@ def test_active_fail_safe_hinders_arming_and_force_passes_over_it() -> None:
     failsafes = Failsafes(replace(P.failsafes, leak_delay_s=0.0, cabin_hot_delay_s=0.0))
     wet = GOOD._replace(leak=True, cabin_c=75.0)
     failsafes.step(wet, Mode.POSHOLD, False, False)
-    assert reasons(wet, failsafes=failsafes) == ["water in a cabin", "cabin at 75 degC"]
+    assert reasons(wet, failsafes=failsafes) == ["water in a cabin", "cabin hot: 75 degC"]
     assert reasons(wet, failsafes=failsafes, forced=True) == []
 
 

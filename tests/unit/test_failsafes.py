@@ -143,14 +143,14 @@ def test_alarm_ends_when_its_cause_is_gone_for_a_while() -> None:
     failsafes.step(GOOD._replace(cabin_c=80.0), Mode.AUTO, False, True)
     assert failsafes.level == Level.SURFACE
     assert failsafes.step(at(GOOD, 1.0), Mode.AUTO, False, True) == []
-    again = Alarm("cabin_hot", "cabin at 80 degC", Level.SURFACE, True, again=True)
+    again = Alarm("cabin_hot", "cabin hot: 80 degC", Level.SURFACE, True, again=True)
     assert failsafes.step(at(GOOD._replace(cabin_c=80.0), 2.0), Mode.AUTO, False, True) == [again]
     assert failsafes.step(at(GOOD._replace(cabin_c=80.0), 2.5), Mode.AUTO, False, True) == []
     assert failsafes.step(at(GOOD, 3.0), Mode.AUTO, False, True) == []
     late = at(GOOD, 5.0)
     assert failsafes.step(late._replace(time_ns=late.time_ns - 1), Mode.AUTO, False, True) == []
     (alarm,) = failsafes.step(late, Mode.AUTO, False, True)
-    assert alarm == Alarm("cabin_hot", "cabin at 30 degC", Level.SURFACE, False)
+    assert alarm == Alarm("cabin_hot", "cabin hot", Level.SURFACE, False)
     assert failsafes.level == Level.NONE
     assert failsafes.step(at(GOOD, 6.0), Mode.AUTO, False, True) == [], "said once"
 
@@ -198,7 +198,7 @@ def test_only_what_is_more_than_a_warning_hinders_arming() -> None:
     health = GOOD._replace(voltage_share=0.85, cabin_c=81.0, silent_s=0.7)
     assert failsafes.active(health) == []
     failsafes.step(health, Mode.AUTO, False, False)
-    assert failsafes.active(health) == ["cabin at 81 degC", "a module is silent for 0.7 s"]
+    assert failsafes.active(health) == ["cabin hot: 81 degC", "a module is silent for 0.7 s"]
 
 
 WORDS = {
@@ -207,22 +207,22 @@ WORDS = {
     "foreign_sync": "somebody else sends SYNC",
     "foreign_command": "somebody else commands modules",
     "battery_critical": "battery critical: 80% of its voltage",
-    "cabin_hot": "cabin at 70 degC",
+    "cabin_hot": "cabin hot: 70 degC",
     "cabin_pressure": "cabin pressure off by 20000 Pa",
     "axis_lost": "the thrusters left cannot make every wrench",
     "depth_unknown": "depth unknown for 5.0 s",
     "tag_gone": "no tag for 8.0 s",
     "partner_lost": "a docked partner is lost",
     "estimator": "sensors and model disagree: 5.0 of the expected",
-    "rejected": "80% of the tags refused",
+    "rejected": "tags refused: 80% of them",
     "tag_lost": "no tag for 8.0 s",
     "pushed": "pushed out of sight as by a current of 0.5 m/s",
     "tag_late": "no tag for 1.0 s",
     "depth_lost": "no pressure for 1.0 s",
     "imu_lost": "no IMU for 0.5 s",
     "module_silent": "a module is silent for 0.5 s",
-    "ticks_missed": "5 ticks missed in a second",
-    "fence": "0.00 m outside the fence",
+    "ticks_missed": "ticks missed: 5 in a second",
+    "fence": "outside the fence by 0.00 m",
     "ground_lost": "ground station silent for 5.0 s",
     "pilot_lost": "pilot silent for 1.0 s",
     "thruster_lost": "a thruster is out",
@@ -237,13 +237,24 @@ def test_every_alarm_has_its_words(name: str) -> None:
     assert Watch(ROWS[name], P).words(bad(name)) == WORDS[name]
 
 
+@pytest.mark.parametrize("name", FIELDS)
+def test_alarm_that_is_over_says_what_has_cleared_and_no_figure(name: str) -> None:
+    """It said "fail-safe over: no IMU for 0.0 s"."""
+    failsafes = Failsafes(quick(name))
+    mode = min(ROWS[name].modes)
+    (on,) = failsafes.step(bad(name), mode, False, True)
+    failsafes.step(at(GOOD, 1.0), mode, False, False)
+    (over,) = failsafes.step(at(GOOD, 9.0), mode, False, False)
+    assert not over.begins and on.words.startswith(over.words) and not any(sign in over.words for sign in "0123456789{}")
+
+
 @pytest.mark.parametrize(
     ("health", "armed", "says"),
     [
-        (GOOD, True, "no tag for 0.0 s"),
+        (GOOD, True, "no tag"),
         (GOOD._replace(tag_age_s=9.0), True, "no tag for 9.0 s, which does not count in MANUAL"),
         (GOOD._replace(tag_age_s=9.0), False, "no tag for 9.0 s, which does not count while disarmed"),
-        (GOOD._replace(tag_age_s=P.tag_lost_limit), True, f"no tag for {P.tag_lost_limit:.1f} s"),
+        (GOOD._replace(tag_age_s=P.tag_lost_limit), True, "no tag"),
     ],
 )
 def test_fail_safe_that_ends_while_its_cause_lasts_says_that_it_does(health: Health, armed: bool, says: str) -> None:

@@ -30,7 +30,7 @@ def test_each_fail_safe_is_told_by_the_system_of_its_body(world: World, client: 
     world.run(1)
     said = client.all("STATUSTEXT")
     assert {text.get_srcSystem() for text in said} == {2}
-    assert "".join(text.text for text in said).startswith(f"fail-safe on: {ROWS[name].words.split('{')[0]}")
+    assert "".join(text.text for text in said).startswith(f"fail-safe on: {ROWS[name].words}")
 
 
 def test_refusal_of_one_body_is_told_by_its_system_and_answers_its_command_alone(world: World, client: Client) -> None:

@@ -88,7 +88,7 @@ def test_warning_changes_nothing_but_is_said() -> None:
     assert supervisor.events == [Event(WARNING, "fail-safe on: battery low: 85% of its voltage")]
     supervisor.step(False, at(GOOD, 1), [])
     supervisor.step(False, at(GOOD, 3), [])
-    assert supervisor.events == [Event(INFORMATION, "fail-safe over: battery low: 100% of its voltage")]
+    assert supervisor.events == [Event(INFORMATION, "fail-safe over: battery low")]
 
 
 def test_end_of_a_fail_safe_changes_no_mode() -> None:
@@ -297,7 +297,7 @@ def test_pilot_keeps_control_of_a_robot_that_refuses_its_tags_but_it_holds_no_pl
     for tick in range(500):
         supervisor.step(False, bad._replace(time_ns=GOOD.time_ns + 10_000_000 * tick), [])
         said += texts(supervisor)
-    assert said == ["fail-safe on: 99% of the tags refused"]
+    assert said == ["fail-safe on: tags refused: 99% of them"]
     assert supervisor.mode == mode and supervisor.level == Level.NONE and not supervisor.events
     ask(supervisor, Action.SET_MODE, Mode.POSHOLD, bad._replace(time_ns=GOOD.time_ns + 5_000_000_000))
     assert supervisor.mode == mode, "refused while the cause lasts"
