@@ -189,10 +189,10 @@ class Failsafes:
     pilot_lost_delay_s: float = delay(0.0, "FS_RC_S")
     pilot_lost_action: int = action(2, "FS_RC_ACT")
     pilot_lost_latched: int = latched(0, "FS_RC_LAT")
-    # a thruster is dead or lies
+    # a thruster is dead or lies: it counts as that until the body is disarmed, or the thruster acquitted (core.thruster_trial)
     thruster_lost_delay_s: float = delay(0.0, "FS_THR_S")
     thruster_lost_action: int = action(1, "FS_THR_ACT")
-    thruster_lost_latched: int = latched(1, "FS_THR_LAT")
+    thruster_lost_latched: int = latched(0, "FS_THR_LAT")
     # a module does not report whether it leaks: readings come at 5 Hz; the delay allows for the first one
     cabin_unknown_limit: float = quantity(
         2.0, unit="s", low=0.5, high=60,

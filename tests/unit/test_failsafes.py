@@ -175,7 +175,7 @@ def test_latched_alarm_stays_while_its_cause_does() -> None:
 def test_parameters_say_which_alarms_are_latched() -> None:
     latched = {name for name in FIELDS if Watch(ROWS[name], P).latched}
     assert latched == {
-        "leak", "foreign_sync", "battery_critical", "cabin_pressure", "axis_lost", "thruster_lost",
+        "leak", "foreign_sync", "battery_critical", "cabin_pressure", "axis_lost",
     }  # fmt: skip
 
 

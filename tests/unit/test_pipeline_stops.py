@@ -5,7 +5,7 @@ import pytest
 
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, Mode, ModuleInputs, Request
+from firmware_py.core.types import INFORMATION, WARNING, Action, Event, Mode, ModuleInputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
@@ -112,6 +112,23 @@ def test_robot_that_lost_an_axis_trusts_its_thrusters_again_once_it_is_disarmed(
     tank.run(0.1, Request(Action.DISARM))
     assert pipeline.faults.now.dead == () and tank.run(3.0, Request(Action.ARM)).records[0].state == State.ARMED
     assert tank.outputs[-1].modules[0].thrusters.all(), "and they are used again"
+
+
+def test_warning_of_a_lost_thruster_ends_in_flight_once_the_thruster_is_acquitted(tank: Tank) -> None:
+    """It stayed on until the robot was disarmed, although every thruster was in use again."""
+    tank.run(0.5)
+    tank.run(0.5, Request(Action.ARM))
+    pipeline = tank.pipeline.formation.pipelines[0]
+    pipeline.faults._lose(3, "does not push as it says")
+    tank.run(5.0)
+    assert pipeline.supervisor.is_on("thruster_lost")
+    pipeline.faults._take_back(3)
+    tank.run(1.9)
+    assert pipeline.supervisor.is_on("thruster_lost")
+    tank.run(0.2)
+    said = [event for outputs in tank.outputs for event in outputs.events if "thruster" in event.text]
+    assert said == [Event(WARNING, "fail-safe on: a thruster is out", 0), Event(INFORMATION, "fail-safe over: a thruster is out", 0)]
+    assert pipeline.supervisor.armed and not pipeline.supervisor.is_on("thruster_lost")
 
 
 @pytest.mark.parametrize(("gap_s", "is_armed"), [(0.05, True), (0.5, True), (1.99, True), (2.02, False), (5.0, False), (86_400.0, False)])
