@@ -133,6 +133,7 @@ class FaultDetector:
                     number = other._thruster_at[j][channel]
                     self._obeys[thruster] = other._obeys[number]
                     self._motion.inherit(thruster, other._motion, number)
+        self._motion.take_over([other._motion for other in before])
         self.now = self._usable_state()
 
     def reset(self) -> None:

@@ -8,6 +8,7 @@ trim, buoyancy) are ignored.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
@@ -18,6 +19,7 @@ from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rigid_body import add_restoring, take_coriolis
 from firmware_py.core.rotations import M, V, cross, rotate_back, turned_back
 from firmware_py.core.thruster_trial import ThrusterTrial
+from firmware_py.core.trial_handover import Held, carried_over
 from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
 
@@ -86,6 +88,8 @@ class MissingThrust:
         self._period_s = period_ns * 1e-9
         self.acquitted: int | None = None
         """Thruster that was left out because of its motion, and that this tick showed to be innocent."""
+        self._residual, self._whole = np.zeros(6), 0
+        """Running mean of the wrench residual, and the number of whole blocks in it, at most BASE."""
         self.reset()
         self.forget()
 
@@ -106,7 +110,7 @@ class MissingThrust:
         """Velocity, attitude, forces and specific force of each tick of the block."""
         self._first = self._last = gyro
         self._first_n = self._last_n = 0
-        self._free = True
+        self._free, self._pulled = True, False
 
     def step(
         self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool, free: bool
@@ -119,12 +123,13 @@ class MissingThrust:
         """
         self.acquitted = None
         self._add(measured, estimate, force_n)
-        self._free = self._free and free and estimate.ready
+        self._free, self._pulled = self._free and free and estimate.ready, self._pulled or not free
         if len(self._seen) < self._ticks:
             return None
-        full = self._close(estimate)
+        full, pulled = self._close(estimate), self._pulled
         self._start_block(self._last if self._last_n == len(self._seen) else None)
-        self._judge_trial(full)
+        if not pulled:  # magnets pull for longer than a trial's patience: it waits for the dock, or its end
+            self._judge_trial(full)
         if not (full and armed):
             self._count = 0
             return None
@@ -155,6 +160,8 @@ class MissingThrust:
         if whole and self._last is not None and self._first is not None:
             motion = np.concatenate((felt / accels, (self._last - self._first) / span))
             rest = self._body.mass @ motion - acted - (model + coriolis) / n
+            self._whole = min(self._whole + 1, BASE)
+            self._residual = self._residual + (rest - self._residual) / self._whole
         down_b = rotate_back(estimate.q_wb, DOWN / GRAVITY)
         self._blocks[:-1] = self._blocks[1:]
         doubts = [max(estimate.sigma_q.tolist()), speed / n]
@@ -199,6 +206,13 @@ class MissingThrust:
     def inherit(self, thruster: int, before: MissingThrust, number: int) -> None:
         """Takes over how often `thruster` was acquitted, as number `number` of the body before."""
         self._acquittals[thruster] = before._acquittals[number]
+
+    def take_over(self, before: Sequence[MissingThrust]) -> None:
+        """Goes on with a trial of the body that parts, or of those that join (trial_handover)."""
+        self._trial = carried_over([other._held() for other in before], self._body, self._healthy[0])
+
+    def _held(self) -> Held:
+        return Held(self._body, self._trial, self._residual if self._whole >= LEAST_BASE else None)
 
     def _explain(self, alive: np.ndarray) -> int:
         """Returns the one thruster that explains the change, or -1."""

@@ -33,10 +33,20 @@ class ThrusterTrial:
             sigma: (6,) standard deviation of the residual of a healthy body.
         """
         self.thruster = thruster
-        self._base, self._sigma = base, sigma
+        self.base, self._sigma = base, sigma
         self._wall, self._liar = wall / sigma, np.array(liar).reshape(-1, 6) / sigma
         self._seen: list[np.ndarray] = []
         self._blocks = 0
+
+    def again(self, thruster: int, moved: np.ndarray, base: np.ndarray, sigma: np.ndarray) -> ThrusterTrial:
+        """Returns the same trial at its beginning, in another body (trial_handover).
+
+        Args:
+            thruster: its number there.
+            moved: (6, 6) matrix that takes a wrench from this body to that one.
+            base, sigma: those of that body.
+        """
+        return ThrusterTrial(thruster, base, moved @ (self._wall * self._sigma), [moved @ (way * self._sigma) for way in self._liar], sigma)
 
     def is_innocent(self, residual: np.ndarray | None) -> bool | None:
         """Judges by the residual (6,) of one more block, None where that could not be measured; returns None while there are too few.
@@ -45,7 +55,7 @@ class ThrusterTrial:
         """
         self._blocks += 1
         if residual is not None:
-            self._seen.append((residual - self._base) / self._sigma)
+            self._seen.append((residual - self.base) / self._sigma)
         if len(self._seen) < SETTLE + JUDGED:
             return False if self._blocks >= PATIENCE else None
         outcome = np.mean(self._seen[SETTLE:], axis=0)

@@ -102,6 +102,13 @@ def _place(part: Body, whole: Body) -> tuple[np.ndarray, np.ndarray]:
     return whole.r_bm[j] - r_wp @ part.r_bm[i], np.ascontiguousarray(r_wp.T)
 
 
+def moved_wrench(old: Body, new: Body) -> np.ndarray:
+    """(6, 6) matrix that takes a wrench on `old` to the same one on `new`, each about its body's centre of mass and along its axes. The
+    bodies share a module.
+    """
+    return _transport(*_place(old, new)).T  # as nu_old = H nu_new, and the power is the same
+
+
 def _transport(lever_b: np.ndarray, turn: np.ndarray) -> np.ndarray:
     """(6, 6) H with nu_part = H nu_whole, for a part at `lever_b` whose axes are `turn` @ those of the whole."""
     h = np.zeros((6, 6))

@@ -34,6 +34,7 @@ class Water:
         self.speed_factor, self.stray_rpm = np.ones(n), np.zeros(n)
         self.status = np.zeros(n, dtype=int)
         self.heard = 1.0
+        self.accel_bias = np.full(3, 0.05)
         self.free = True
         self.pushed = np.zeros(6)
         """Wrench of a wall or a hand, N and N m, body frame."""
@@ -49,13 +50,13 @@ class Water:
         """Returns the faults found, each with the time since the start of this run, s."""
         found = []
         for n in range(round(seconds / DT)):
-            found += [((n + 1) * DT, words) for words in self._step(wanted if armed else np.zeros(8), armed)]
+            found += [((n + 1) * DT, words) for words in self._step(wanted if armed else np.zeros(self.gain.size), armed)]
         return found
 
     def _step(self, wanted: np.ndarray, armed: bool) -> list[str]:
         self.tick += 1
         if armed:
-            wanted = wanted + BODY.thrusters.pinv @ self._steer()
+            wanted = wanted + self.body.thrusters.pinv @ self._steer()
         wanted = np.where(self.detector.now.alive, wanted, 0.0)
         believed, acting = self.believed.step(), self.acts.step()
         self.believed.command(wanted)
@@ -69,29 +70,32 @@ class Water:
         )  # fmt: skip
         gyro = self.x[10:13] + 0.005 + 0.002 * self.rng.normal(size=3)
         weight = to_matrix(self.x[3:7].copy()).T @ np.array([0.0, 0.0, 9.80665])
-        accel = felt - weight + 0.05 + 0.03 * self.rng.normal(size=3)
+        accel = felt - weight + self.accel_bias + 0.03 * self.rng.normal(size=3)
         measured = Measured(gyro, accel, None, [])
         if self.rng.uniform() >= self.heard:
             measured = Measured(None, None, None, [])
-        module = ModuleInputs(esc=self._feedback())
-        self.detector.step([module], measured, estimate, self.believed.force_n, believed, armed, self.free)
+        fleet = [ModuleInputs() for _ in range(max(b.modules) + 1)]
+        for number, module in enumerate(b.modules):
+            fleet[module] = ModuleInputs(esc=self._feedback(8 * number))
+        self.detector.step(fleet, measured, estimate, self.believed.force_n, believed, armed, self.free)
         return self.detector.words
 
     def _steer(self) -> np.ndarray:
         q = self.x[3:7].copy()
         off = np.r_[to_matrix(q).T @ (self.start[:3] - self.x[:3]), difference(self.start[3:7].copy(), q)]
-        return BODY.mass @ (np.repeat([6.0, 9.0], 3) * off - np.repeat([5.0, 6.0], 3) * self.x[7:13])
+        return self.body.mass @ (np.repeat([6.0, 9.0], 3) * off - np.repeat([5.0, 6.0], 3) * self.x[7:13])
 
-    def _feedback(self) -> list[EscFeedback]:
+    def _feedback(self, at: int) -> list[EscFeedback]:
+        """ESC frames of the module whose thrusters are `at` and the seven that follow."""
         frames = []
         for first in range(0, 8, 2):
             if self.tick % 10 == first and self.rng.uniform() < self.heard:
                 rpm = [
                     self.speed_factor[i] * self.detector.believed_rpm(i, float(self.acts.force_n[i]))
                     + self.stray_rpm[i] + 5.0 * self.rng.normal()
-                    for i in (first, first + 1)
+                    for i in (at + first, at + first + 1)
                 ]
-                status = (int(self.status[first]), int(self.status[first + 1]))
+                status = (int(self.status[at + first]), int(self.status[at + first + 1]))
                 frames.append(EscFeedback(first, (rpm[0], rpm[1]), (0.5, 0.5), status))
         return frames
 
