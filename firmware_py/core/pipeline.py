@@ -18,7 +18,7 @@ from firmware_py.core.estimator import Estimator
 from firmware_py.core.faults import FaultDetector
 from firmware_py.core.formation import Formation
 from firmware_py.core.guidance_modes import Guidance
-from firmware_py.core.health import HealthMonitor
+from firmware_py.core.health_monitor import HealthMonitor
 from firmware_py.core.joints import holding, joints_of
 from firmware_py.core.limiter import Limiter
 from firmware_py.core.measurements import Measurements

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.core.health import beyond
+from firmware_py.core.fence import beyond
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.schema import limits_of
 from firmware_py.ground.dialect import Message

@@ -9,7 +9,9 @@ import pytest
 
 from firmware_py.core.body import Body
 from firmware_py.core.faults import ThrusterFaults
-from firmware_py.core.health import NEVER_S, Health, HealthMonitor, outside
+from firmware_py.core.fence import outside
+from firmware_py.core.health import NEVER_S, Health
+from firmware_py.core.health_monitor import HealthMonitor
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import exp
 from firmware_py.core.thruster_names import Place
