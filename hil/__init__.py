@@ -4,4 +4,7 @@ from pathlib import Path
 
 from firmware_py.compiled_code import forget_stale_code
 
+DEFAULT_BUS = "virtual:modcube"
+"""Bus of a flight for which none is named: inside one process."""
+
 forget_stale_code(Path(__file__).parents[1], "hil", "firmware_py")

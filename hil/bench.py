@@ -21,6 +21,7 @@ from firmware_py.runtime.disk import writing_to
 from firmware_py.runtime.interrupts import interrupts_deferred
 from firmware_py.runtime.realtime import quiet_garbage
 from firmware_py.runtime.recorder import Recorder
+from hil import DEFAULT_BUS
 from hil.dock_script import DockScript
 from hil.faults import Faults
 from hil.force_script import ForceScript
@@ -31,7 +32,6 @@ from hil.scenario import Scenario, make_world
 from hil.script import Script
 from hil.truth_log import TruthRecorder
 
-DEFAULT_BUS = "virtual:modcube"
 LOOK_S = 0.005
 """Polling period while listening to a bus: SYNC comes at 50 Hz at least."""
 SCRIPTS: dict[str, Callable[[Scenario, Fleet], Orders]] = {"dock": DockScript, "force": ForceScript, "mode": ModeScript}

@@ -1,4 +1,7 @@
-"""The commands `modcube hil ...`: run a scenario, run many seeds of it, run the plant alone, list the scenarios."""
+"""The commands `modcube hil ...`: run a scenario, run many seeds of it, run the plant alone, list the scenarios.
+
+Whatever needs compiled code is imported by the command that uses it: help and the list come at once, also before the code was compiled.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +9,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,17 +18,16 @@ from firmware_py.description.schema import DescriptionError, did_you_mean, read_
 from firmware_py.runtime.folders import folder_of
 from firmware_py.runtime.interrupts import ended_at_once, interrupted_once
 from firmware_py.runtime.recorder import CAN_LOG
-from hil.bench import DEFAULT_BUS, fleet_of
-from hil.plant.world import STEP_NS
-from hil.scenario import Scenario, load_scenario, scenario_names
-from hil.script import mistake_of_flight
+from hil import DEFAULT_BUS
+from hil.scenario_files import scenario_file, scenario_names
+
+if TYPE_CHECKING:
+    from hil.scenario import Scenario
 
 app = typer.Typer(help="The bench: the firmware against a simulated plant on the same CAN bus.", no_args_is_help=True)
 
 FAILED = 1
 """Exit status when a check failed."""
-RATES_HZ = tuple(rate for rate in range(50, 401) if 1_000_000_000 % (rate * STEP_NS) == 0)
-"""Tick rates whose period is a whole number of the plant's sub-steps."""
 
 ScenarioName = Annotated[str, typer.Argument(help="scenario name (see `modcube hil list`), or .toml file")]
 Controller = Annotated[str, typer.Option(help="modcube, least_power, paper, paper_sequence, or a parameter file")]
@@ -46,6 +48,10 @@ def parameters_of(controller: str) -> Parameters:
 
 def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
     """The scenario `name` with the changes from the command line. Raises DescriptionError."""
+    from hil.bench import fleet_of
+    from hil.scenario import load_scenario
+    from hil.script import mistake_of_flight
+
     scenario = load_scenario(name)
     if sensors not in ("real", "ideal"):
         raise DescriptionError(f"sensors {sensors!r} is unknown; there are real, ideal")
@@ -60,9 +66,12 @@ def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
 
 def check_rate(rate_hz: int) -> None:
     """Raises DescriptionError for a rate whose period is not a whole number of the plant's sub-steps."""
-    if rate_hz not in RATES_HZ:
+    from hil.plant.world import STEP_NS
+
+    rates_hz = [rate for rate in range(50, 401) if 1_000_000_000 % (rate * STEP_NS) == 0]
+    if rate_hz not in rates_hz:
         why = f"a tick is no whole number of the plant's sub-steps of {1e-6 * STEP_NS:g} ms"
-        raise DescriptionError(f"--rate {rate_hz}: {why}; it takes {', '.join(map(str, RATES_HZ))}")
+        raise DescriptionError(f"--rate {rate_hz}: {why}; it takes {', '.join(map(str, rates_hz))}")
 
 
 def check_reaches_others(bus: str, who: str, kinds: tuple[str, ...] = ("virtual:",)) -> None:
@@ -200,12 +209,13 @@ def _check_fault_options(context: typer.Context) -> None:
 
 def _fly_faults(jobs: int, seed: int, out: Path | None) -> int:
     """Flies and prints the fault matrix; returns the exit status."""
-    from hil.console import campaign_progress
-    from hil.fault_campaign import run_fault_campaign
-    from hil.fault_matrix import print_faults
-    from hil.fault_table import ROWS
-    from hil.scenario import MODES
-    from hil.workers import processes
+    with ended_at_once():
+        from hil.console import campaign_progress
+        from hil.fault_campaign import run_fault_campaign
+        from hil.fault_matrix import print_faults
+        from hil.fault_table import ROWS
+        from hil.scenario import MODES
+        from hil.workers import processes
 
     with interrupted_once(), campaign_progress("every fault in every mode", len(ROWS) * len(MODES)) as progress:
         cells = run_fault_campaign(processes(jobs), out if out is not None else Path("runs") / "faults-campaign", seed, progress)
@@ -222,7 +232,9 @@ def plant(
     out: Annotated[Path | None, typer.Option(parser=folder_of, metavar="DIR", help="folder for the log of the true motion")] = None,
 ) -> None:
     """Run the simulated plant alone, in real time, until SIGINT or SIGTERM: the other end of `modcube run`."""
-    from hil.plant_process import serve_until_signal
+    with ended_at_once():
+        from hil.plant_process import serve_until_signal
+        from hil.scenario import load_scenario
 
     check_reaches_others(bus, "the plant alone")
     serve_until_signal(load_scenario(scenario).for_seed(seed), seed, bus, rate_hz, out)
@@ -232,4 +244,4 @@ def plant(
 def list_scenarios() -> None:
     """The scenarios that the package carries."""
     for name in scenario_names():
-        typer.echo(f"{name:20s} {load_scenario(name).help}")
+        typer.echo(f"{name:20s} {read_toml(scenario_file(name))[0]['help']}")

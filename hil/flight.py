@@ -21,7 +21,8 @@ from firmware_py.description.signals import read_signals
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import groups_of, passive_axes
 from firmware_py.runtime.recorder import CAN_LOG
-from hil.bench import DEFAULT_BUS, SCRIPTS, fleet_of, fly_scenario
+from hil import DEFAULT_BUS
+from hil.bench import SCRIPTS, fleet_of, fly_scenario
 from hil.checks import RESULT_FILE, Flown, Limit, Result, judge, write_result
 from hil.dock_plot import DOCK_PLOT, write_dock_plot
 from hil.docking_metrics import docking_metrics

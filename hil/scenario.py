@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +31,7 @@ from hil.plant.lattice import is_connected
 from hil.plant.polycube import grow
 from hil.plant.spec import CALM, HALF_A_COUNT, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
+from hil.scenario_files import scenario_file, scenario_names
 from hil.scenario_rules import mistakes
 from hil.starts import places_of, refuse_in_walls, refuse_overlap, starts_of
 
@@ -288,18 +288,12 @@ def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
     return world
 
 
-def scenario_names() -> list[str]:
-    """Names of the scenarios that come with the package."""
-    folder = resources.files("hil") / "scenarios"
-    return sorted(f.name[:-5] for f in folder.iterdir() if f.name.endswith(".toml"))
-
-
 def load_scenario(name: str) -> Scenario:
     """Loads the scenario called `name`, or the .toml file at the path `name`. Raises DescriptionError with a one-line message."""
     if name.endswith(".toml"):
         path = Path(name)
     elif name in scenario_names():
-        path = Path(str(resources.files("hil") / "scenarios" / f"{name}.toml"))
+        path = scenario_file(name)
     else:
         refuse_folder(name)
         question, known = did_you_mean(name, scenario_names()), ", ".join(scenario_names())

@@ -20,7 +20,7 @@ CLIENTS = Path(".venv-clients/.stamp")
 PYTEST = [sys.executable, "-m", "pytest"]
 ALL = [*PYTEST, "-n", "2", "--dist", "loadfile", "--no-loadscope-reorder"]
 """The fixtures of a file are set up in one process; the files with the long flights come first."""
-COMPILE = [sys.executable, "-c", "import hil.batch, hil.cli"]
+COMPILE = [sys.executable, "-c", "import hil.batch, hil.bench"]
 """Nearly all numba functions are compiled on import."""
 VCAN = [*PYTEST, "--capture=no", "-rs", "-m", "vcan", "tests/vcan"]
 

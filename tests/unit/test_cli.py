@@ -21,7 +21,7 @@ from firmware_py.description.schema import describe
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import load_vehicle, vehicle_names
 from firmware_py.runtime.guarded_file import GuardedFile
-from hil.scenario import scenario_names
+from hil.scenario_files import scenario_names
 from hil.trial_file import TrialFile
 from hil.truth_log import TruthRecorder
 
@@ -216,6 +216,14 @@ def test_list_names_every_scenario_with_one_line_of_help(printed: Callable[..., 
     lines = printed("hil", "list").splitlines()
     assert [line.split()[0] for line in lines] == scenario_names()
     assert all(len(line.split()) > 3 for line in lines)
+
+
+@pytest.mark.parametrize("arguments", ["--help", "hil --help", "hil run --help", "hil list"])
+def test_help_and_list_wait_for_no_code_of_the_bench_to_be_compiled(arguments: str) -> None:
+    look = "import atexit, sys; atexit.register(lambda: print('firmware_py.core.rotations' in sys.modules, file=sys.stderr))"
+    code = f"{look}; from firmware_py.__main__ import main; main()"
+    ran = subprocess.run([sys.executable, "-c", code, *arguments.split()], capture_output=True, text=True)
+    assert (ran.returncode, ran.stderr) == (0, "False\n")
 
 
 @pytest.fixture

@@ -10,7 +10,8 @@ from firmware_py.bus.codec import Frame, Received, Receiver, unpack_quaternion
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
 from hil.nodes import Nodes, make_nodes
-from hil.scenario import Scenario, load_scenario, make_world, scenario_names
+from hil.scenario import Scenario, load_scenario, make_world
+from hil.scenario_files import scenario_names
 from tests.unit.mcu_frames import ARMED, CODEC, DISARMED, PUSHES, REST, dock, magnets, sync, thrust
 
 PERIOD_NS = 10_000_000

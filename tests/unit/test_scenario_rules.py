@@ -20,7 +20,8 @@ from hil.campaign import identity
 from hil.dock_script import AFTERWARDS_NS, DockScript
 from hil.force_metrics import force_names
 from hil.metrics import DOCKING, SHOWN
-from hil.scenario import Scenario, Step, load_scenario, make_world, scenario_names
+from hil.scenario import Scenario, Step, load_scenario, make_world
+from hil.scenario_files import scenario_names
 from hil.scenario_rules import metric_names
 from hil.script import Script
 from tests.unit.tanks import FaultyTank
