@@ -98,8 +98,9 @@ def _conditions(axes: Any, time_s: np.ndarray, rows: Columns) -> None:
     end_s = time_s[-1] + LAST_SHARE * duration_s
     for level, name in enumerate(("current_holds", "position_holds")):
         holds = np.append(rows[name], rows[name][-1]).astype(float)
-        axes.fill_between(np.append(time_s, end_s), level, level + 0.8 * holds, step="post", color=HOLDS, linewidth=0)
+        axes.fill_between(np.append(time_s, end_s), level, level + 0.8 * holds, step="post", color=HOLDS, linewidth=0, zorder=2.1)
     axes.set_yticks([0.4, 1.4, 2.5], ["current", "position", "stage"])
+    axes.grid(visible=False, axis="y")  # it would strike through the names of the stages
     axes.set(xlim=(time_s[0], end_s), ylim=(-0.1, 3.1), xlabel="time (s)", title="Conditions for a dock (green: holds), and its stages")
     starts = np.flatnonzero(np.diff(rows["stage"], prepend=-1))
     again = rows["tries"].max() > 1

@@ -20,6 +20,8 @@ NOT_JUDGED = "before or after the task, not judged"
 JOINED = "modules join or part: the origin moves"
 """Meaning of a vertical line in every plot over time."""
 ROUNDING_S = 1e-6
+PARTING_S = 2.0
+"""Time before and after a join or part in which plant and firmware may disagree on which modules form the body."""
 MODULE_COLUMNS = 4
 """Modules whose thrusters are plotted side by side."""
 
@@ -102,7 +104,8 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
         axes.set(title=f"{what} error, truth against reference{without}", ylabel=unit)
         axes.set_ylim(0.0, 1.3 * max(float(values[inside].max()), *(line.get_ydata()[0] for line in axes.lines[1:])))
         _finish_time_axis(axes, flight, window, last=row == 1)
-        axes.legend(handles=axes.lines[1:], loc="upper right", ncols=2, fontsize=9)
+        named = {line.get_label(): line for line in axes.lines[1:]}  # modules may join and part several times
+        axes.legend(handles=list(named.values()), loc="upper right", ncols=2, fontsize=9)
         _say_unplaced(axes, flight)
     bands = [patch for patch in figure.axes[-1].patches if patch.get_label() == NOT_JUDGED]
     if bands:
@@ -180,13 +183,14 @@ def estimate(flight: Flight, window: Window) -> Any:
     sigmas = 1e3 * flight.firmware["sigma_p"], np.degrees(flight.firmware["sigma_q"])
     bands = tuple(_once_placed(flight, 3.0 * sigma) for sigma in sigmas)
     names = (("x, mm", "y, mm", "z, mm"), ("roll, deg", "pitch, deg", "yaw, deg"))
+    whole = np.all(np.abs(flight.time_s[:, None] - np.array(_joins_s(flight))) > PARTING_S, axis=1)
     for column, (error, band) in enumerate(zip((off_mm, off_deg), bands, strict=True)):
         for axis in range(3):
             cell, limit = cells[axis, column], band[:, axis]
             cell.fill_between(flight.time_s, -limit, limit, color=ESTIMATE, alpha=0.22, linewidth=0, label="3 sigma")
             cell.plot(flight.time_s, error[:, axis], color=TRUTH, linewidth=0.9, label="error of the estimate")
             cell.set(ylabel=names[column][axis])
-            _limit_to_window(cell, flight, window, np.stack([error[:, axis], limit, -limit]))
+            _limit_to_window(cell, flight, window, np.where(whole, np.stack([error[:, axis], limit, -limit]), np.nan))
             _finish_time_axis(cell, flight, window)
     cells[0, 0].set_title("Position: estimate against truth")
     cells[0, 1].set_title("Attitude: estimate against truth")

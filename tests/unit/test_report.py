@@ -284,6 +284,31 @@ def test_position_of_a_dock_shows_the_other_module_and_when_the_origin_moves(doc
     pyplot.close(figure)
 
 
+def parted_again(dock: Flight) -> Flight:
+    """The dock, after which the firmware takes the body apart; for ten ticks it has taken it for a whole one, 0.1 m off."""
+    commanded, p_wb = dock.firmware["commanded_n"].copy(), dock.firmware["p_wb"].copy()
+    commanded[-50:] = commanded[0]
+    p_wb[-60:-50] += 0.1
+    return dataclasses.replace(dock, firmware=dock.firmware | {"commanded_n": commanded, "p_wb": p_wb})
+
+
+def test_legend_names_joins_once_however_many_there_are(dock: Flight) -> None:
+    figure = overview(parted_again(dock), Window(0.0, 2.0), TANK_M, None)
+    for axes in figure.axes[1:]:
+        assert len([line for line in axes.lines if line.get_label() == JOINED]) == 2
+        assert [text.get_text() for text in axes.get_legend().get_texts()].count(JOINED) == 1
+    pyplot.close(figure)
+
+
+def test_errors_of_a_body_that_comes_apart_do_not_flatten_those_of_the_estimate(dock: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hil.plots.PARTING_S", 0.2)
+    figures = [estimate(each, Window(0.0, 2.0)) for each in (dock, parted_again(dock))]
+    before, after = (figure.axes[0].get_ylim() for figure in figures)
+    assert after == pytest.approx(before, rel=0.2)
+    for figure in figures:
+        pyplot.close(figure)
+
+
 def test_plots_of_a_dock_say_whose_body_they_show(dock: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **_: said.append(f"{path.stem}: {figure.get_suptitle()}"))
