@@ -128,7 +128,7 @@ def print_result(result: Result, report: Path | None = None, console: Console | 
         console.print(line, highlight=False, markup=False)
     failed = [shown(c.name).label for c in result.checks if not c.passed]
     verdict = f"FAILED: {'; '.join(failed)}" if failed else "passed" if result.passed else "FAILED: nothing was checked"
-    console.print(verdict, style="green" if result.passed else "bold red", highlight=False)
+    console.print(verdict, style="green" if result.passed else "bold red", highlight=False, soft_wrap=True)
     if result.no_tag_reason:
         console.print(result.no_tag_reason, highlight=False, markup=False, soft_wrap=True)
     if report is not None:

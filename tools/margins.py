@@ -119,7 +119,7 @@ def draw(path: Path, found: Found) -> None:
             for panel, part in ((gain, 0), (phase, 1)):
                 values = np.array([c[part] for c in curves])
                 panel.fill_between(w, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.15, linewidth=0)
-                panel.plot(w, values[0], color=colour)
+                panel.plot(w, values[0], color=colour, marker=".", markersize=3)
             mark(gain, phase, found[modules][NOMINAL][axis], AXES[axis], colour)
         gain.axhline(0.0, color="#30363d", linewidth=0.8)
         phase.axhline(-180.0, color="#30363d", linewidth=0.8)
@@ -133,7 +133,7 @@ def draw(path: Path, found: Found) -> None:
     panels[1, 0].set(ylabel="phase, deg", ylim=(-400, 100), yticks=range(-360, 91, 90))
     for panel in panels.flat:
         panel.grid(color="#d8dee4", linewidth=0.6)
-    what = f"Loops broken at the plant's input; bands: mass, inertia and thruster lag +-{SPREAD:.0%}"
+    what = f"Loops broken at the plant's input, measured at the dots; bands: mass, inertia and thruster lag +-{SPREAD:.0%}"
     figure.suptitle(f"{what}\nmarks and bars: crossover and least margins of the nominal plant", fontsize=11)
     figure.tight_layout()
     figure.savefig(path, dpi=110)

@@ -46,6 +46,7 @@ def _panels(rows: int, columns: int, size: tuple[float, float], **how: Any) -> t
     figure, panels = plt.subplots(rows, columns, figsize=size, squeeze=False, **how)
     for panel in panels.flat:
         panel.grid(color="#d8dee4", linewidth=0.6)
+        panel.set_axisbelow(True)
     return figure, panels
 
 

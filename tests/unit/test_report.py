@@ -412,11 +412,11 @@ def test_every_metric_of_a_flight_has_a_name_for_people(result: Result) -> None:
 
 
 def test_terminal_table_names_the_check_that_failed(result: Result) -> None:
-    console = Console(file=io.StringIO(), width=120)
-    limits = [Limit("position_rmse_m", high=1e-6), Limit("attitude_max_rad", high=1.0)]
+    console = Console(file=io.StringIO(), width=80)
+    limits = [Limit("position_rmse_m", high=1e-6), Limit("attitude_rmse_rad", high=1e-6), Limit("attitude_max_rad", high=1.0)]
     print_result(judge("spiral", 7, result.metrics, limits), Path("out") / "report.html", console)
     text = console.file.getvalue()  # type: ignore[attr-defined]
-    assert "FAILED: Position RMSE, truth against reference" in text
+    assert "FAILED: Position RMSE, truth against reference; Attitude RMSE, truth against reference\n" in text  # longer than a line
     assert "spiral, seed 7" in text
     assert "report: out/report.html" in text
 
