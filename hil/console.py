@@ -125,7 +125,7 @@ def print_result(result: Result, report: Path | None = None, console: Console | 
     console = console or Console()
     console.print(result_table(result))
     for line in warning_lines(result.warnings):
-        console.print(line, highlight=False, markup=False)
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
     failed = [shown(c.name).label for c in result.checks if not c.passed]
     verdict = f"FAILED: {'; '.join(failed)}" if failed else "passed" if result.passed else "FAILED: nothing was checked"
     console.print(verdict, style="green" if result.passed else "bold red", highlight=False, soft_wrap=True)

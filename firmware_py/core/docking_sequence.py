@@ -226,7 +226,8 @@ class DockingSequence:
             return
         sigma = float(np.sqrt(np.max(active.sigma_p**2 + target.sigma_p**2)))
         if sigma > self._p.sigma_m and self.stage not in (Stage.RELEASE, Stage.BACK_OFF):
-            self.abort(time_ns, f"relative sigma {sigma * 1e3:.1f} mm, {self._p.sigma_m * 1e3:.1f} permitted")
+            known = f"relative sigma {sigma * 1e3:.1f} mm, {self._p.sigma_m * 1e3:.1f} permitted"
+            self.abort(time_ns, known if active.placed and target.placed else "no tag has told yet where one of the two bodies is")
             return
         row = TABLE[self.stage]
         if self._waited_ns > self._p.timeout_s * 1e9:

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from firmware_py.core.docking_sequence import DockingSequence, Stage
 from firmware_py.core.rotations import conjugate, difference, from_euler, multiply, rotate, rotate_back, to_matrix
 from firmware_py.core.setpoint import REST, Wish
-from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockRequest
+from firmware_py.core.types import NEVER_AGE_NS, RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockRequest
 from firmware_py.description.parameters import PAPER, Docking
 from firmware_py.description.vehicle import FACE_NORMALS, load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
@@ -353,6 +353,13 @@ def test_dock_needs_both_places_known_but_backs_off_blindly(side: str) -> None:
     dock.step()
     assert dock.sequence.stage == Stage.ABORTED
     assert dock.sequence.reason == "relative sigma 6.1 mm, 5.0 permitted"
+
+
+def test_dock_to_a_body_that_no_camera_has_seen_is_ended_in_words() -> None:
+    dock = Follower()
+    dock.there = estimate(dock.there.p_wb, 1e3)._replace(tag_age_ns=NEVER_AGE_NS)
+    dock.step()
+    assert dock.sequence.reason == "no tag has told yet where one of the two bodies is"
 
 
 def test_push_of_no_time_is_a_jam_at_once() -> None:
