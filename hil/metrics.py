@@ -167,9 +167,9 @@ def _passive_rotations(flight: Flight) -> list[int]:
 
 
 def passive_words(flight: Flight) -> str:
-    """Words for a title of attitude errors: `, without passive pitch`; empty where all rotations count."""
+    """A line to end a title of attitude errors: `without passive pitch`; empty where all rotations count."""
     names = [AXES[axis] for axis in flight.passive if axis in PASSIVE]
-    return f", without passive {' and '.join(names)}" if names else ""
+    return f"\nwithout passive {' and '.join(names)}" if names else ""
 
 
 def flight_metrics(

@@ -87,7 +87,7 @@ def test_rotation_that_is_left_to_buoyancy_is_shown_by_itself_and_is_no_attitude
     assert metrics["passive_pitch_max_rad"] == pytest.approx(0.2, abs=1e-9)
     assert not {"passive_roll_max_rad", "passive_yaw_max_rad"} & set(metrics)
     assert flight.between(START_NS, START_NS).passive == (4,)
-    assert passive_words(flight) == ", without passive pitch"
+    assert passive_words(flight) == "\nwithout passive pitch"
     assert "not in the attitude errors" in shown("passive_pitch_max_rad").label
 
 
