@@ -29,7 +29,7 @@ class DockScript(Orders):
 
     def __init__(self, scenario: Scenario, fleet: Fleet) -> None:
         for step in scenario.step:
-            if step.do == "moebius":
+            if step.do in ("moebius_start", "moebius"):
                 refuse_outside(_strip(step, scenario), scenario)
         self._scenario = scenario
         self._fleet = fleet
@@ -140,7 +140,8 @@ def _path(step: Step, scenario: Scenario, p_wb: np.ndarray, q_wb: np.ndarray) ->
     here = rest_at(np.array(p_wb), np.array(q_wb))
     if step.do == "move":
         return paths.line(here, rest_at(np.array(step.position_m), np.array(q_wb)), step.duration_s)
-    return _strip(step, scenario)
+    strip = _strip(step, scenario)
+    return paths.line(here, strip.sample(0.0), step.duration_s) if step.do == "moebius_start" else strip
 
 
 def _strip(step: Step, scenario: Scenario) -> Trajectory:

@@ -83,8 +83,9 @@ class Step:
     """One step of a docking task; begins after the previous step, or together with it (`also`)."""
 
     do: str = quantity(
-        choices=("dock", "undock", "move", "moebius", "wait"),
-        help="dock, undock: the named faces; move: the body of `module` to position_m; moebius: the body of `module` along the strip",
+        choices=("dock", "undock", "move", "moebius_start", "moebius", "wait"),
+        help="dock, undock: the named faces; move: the body of `module` to position_m, with its attitude; moebius_start: to the start of the "
+        "strip; moebius: along the strip",
     )
     module: int = quantity(2, low=1, high=29, help="number of the active module")
     face: str = quantity("-x", choices=FACE_NAMES, help="face of the active module")
@@ -93,7 +94,7 @@ class Step:
     quarter_turns: int = quantity(0, low=0, high=3, help="quarter turns of the active face about its normal")
     both_approach: bool = quantity(False, help="whether both bodies move towards each other, as in the paper")
     position_m: np.ndarray = quantity([0, 0, 0], unit="m", low=-100, high=100, shape=(3,), help="move: target position, world")
-    duration_s: float = quantity(10.0, unit="s", low=0, high=3600, help="move, moebius, wait: duration of the step")
+    duration_s: float = quantity(10.0, unit="s", low=0, high=3600, help="duration of a step that is no dock or undock")
     also: bool = quantity(False, help="whether the step begins together with the previous one")
 
     def __post_init__(self) -> None:
@@ -103,7 +104,9 @@ class Step:
     @property
     def modules(self) -> tuple[int, ...]:
         """Numbers of the modules involved: the active one, then the target of a dock or undock."""
-        return {"wait": (), "move": (self.module,), "moebius": (self.module,)}.get(self.do, (self.module, self.target_module))
+        if self.do in ("dock", "undock"):
+            return (self.module, self.target_module)
+        return () if self.do == "wait" else (self.module,)
 
 
 MODES = ("MANUAL", "STABILIZE", "ALT_HOLD", "POSHOLD", "AUTO", "GUIDED", "SURFACE", "MOTOR_DETECT")

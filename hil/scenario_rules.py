@@ -80,7 +80,7 @@ def _in_steps(scenario: Scenario) -> Iterator[Mistake]:
     kind = scenario.task.kind
     shortest_s = limits_of(type(scenario.task), "duration_s").low
     for i, step in enumerate(scenario.step):
-        if step.do in ("move", "moebius") and step.duration_s < shortest_s:
+        if step.do in ("move", "moebius_start", "moebius") and step.duration_s < shortest_s:
             yield ("step", i, "duration_s"), f"{step.duration_s:g} s; a {step.do} takes {shortest_s:g} s at least"
     if kind != "dock" and scenario.step:
         yield ("step", 0), f"a task of the kind {kind} runs no steps; only dock does"

@@ -7,6 +7,7 @@ import near_miss
 import numpy as np
 import pytest
 
+from firmware_py.core.rotations import difference
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Mode
 from firmware_py.description.parameters import PAPER, Parameters
@@ -72,10 +73,14 @@ def test_paper_s_dock_is_not_tried_again(fly: Fly) -> None:
 
 
 @pytest.mark.slow
-def test_docked_pair_flies_the_moebius_strip_as_one_and_parts_again(fly: Fly) -> None:
+def test_docked_pair_flies_the_moebius_strip_as_one_and_parts_again(fly: Fly, tmp_path: Path) -> None:
     result = fly(load_scenario("dock-mobius"), 0)
     assert result.passed
     assert 0.001 <= result.metrics["docked_rmse_m"] <= 0.007
+    body = read_signals(tmp_path / "run" / "signals.mcap")["/firmware/body0"]
+    docked = np.flatnonzero(body["time_ns"] > 25_000_000_000)[:-1000]
+    turned = [np.linalg.norm(difference(*body["setpoint_q_wb"][k - 1 : k + 1].copy())) for k in docked]
+    assert max(turned) < np.radians(0.5), "it turns to the start of the strip before it flies it"
 
 
 @pytest.mark.slow
