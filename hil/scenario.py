@@ -84,7 +84,7 @@ class Step:
 
     do: str = quantity(
         choices=("dock", "undock", "move", "moebius_start", "moebius", "wait"),
-        help="dock, undock: the named faces; move: the body of `module` to position_m, with its attitude; moebius_start: to the start of the "
+        help="dock, undock: the named faces; move: the body of `module` to position_m, as it is turned; moebius_start: to the start of the "
         "strip; moebius: along the strip",
     )
     module: int = quantity(2, low=1, high=29, help="number of the active module")
