@@ -38,8 +38,10 @@ MOST_STEP_M = 0.5
 MOST_SPEED_M_S, DROP_SPEED_M_S = 2.0, 6.0
 """Greatest speed up or down of a body that is armed, twice that of a module at full thrust; and of one that is not, dropped from 2 m."""
 DOUBT = 25
-"""Readings, half a second of DEPTH frames: so many refused ones more than accepted ones make a sensor distrusted, so many steady ones in a
-row show an offset, and so many accepted ones make it trusted again. Half of the limit of the fail-safe `depth_lost`."""
+"""Readings, half a second of DEPTH frames: so many refused ones more than accepted ones make a sensor distrusted, so many steady ones with
+none near between them show an offset, and so many accepted ones make it trusted again. Half of the limit of the fail-safe `depth_lost`."""
+NEAR_SHARE = 0.5
+"""Share of the gate within which a reading is near. A sensor at the edge of the gate has every other reading refused, and no near one."""
 
 
 class DepthGate:
@@ -141,7 +143,8 @@ class _Sensor:
         if abs(error_m) > gate_m or self.datum.errs:
             self._differ(error_m, gate_m, most_m)
             return False
-        self._steady, self._doubt, self._jumped_m = 0, max(self._doubt - 1, 0), 0.0
+        self._steady = self._steady if abs(error_m) > NEAR_SHARE * gate_m else 0
+        self._doubt, self._jumped_m = max(self._doubt - 1, 0), 0.0
         self.is_distrusted = self.is_distrusted and self._doubt > 0
         self.was_trusted = self.was_trusted or self._doubt == 0
         return not self.is_distrusted
