@@ -37,18 +37,16 @@ class DepthDatum:
         self._usual_m = math.nan
         self.shift_m = self._change_m = math.nan
         """Present offset less the usual one, and change of the offset within the pictures kept, m; NaN until known."""
-        self._scale = 1.0
-        """Factor of all limits, by the noise of the pictures kept."""
 
     @property
     def errs(self) -> bool:
         """Whether the sensor tells another depth than it used to, or one that moves away from the tags."""
-        return abs(self.shift_m) > SHIFT_M * self._scale or abs(self._change_m) > MOVING_M * self._scale
+        return self._is_beyond(self.shift_m, SHIFT_M) or self._is_beyond(self._change_m, MOVING_M)
 
     @property
     def is_steady(self) -> bool:
         """Whether the offset stays as it is, by the last half second of pictures; true while there are too few of them."""
-        return not abs(self._change_m) > STEADY_M * self._scale
+        return not self._is_beyond(self._change_m, STEADY_M)
 
     def hear(self, time_ns: int, depth_m: float) -> None:
         """Keeps a reading: depth of the sensor by its pressure."""
@@ -65,8 +63,6 @@ class DepthDatum:
         half = PICTURES // 2
         earlier, later = sum(itertools.islice(self._offsets, half)), sum(itertools.islice(self._offsets, half, None))
         self._change_m = (later - earlier) / half
-        steps = sorted(abs(after - before) for before, after in itertools.pairwise(self._offsets))
-        self._scale = max(1.0, steps[half - 1] / (MEDIAN_STEP * NOISE_M))
         if math.isnan(self._usual_m) and self.is_steady:
             self._usual_m = (earlier + later) / PICTURES
         self.shift_m = sum(itertools.islice(self._offsets, PICTURES - LATEST, None)) / LATEST - self._usual_m
@@ -76,7 +72,14 @@ class DepthDatum:
     def take_as_usual(self) -> None:
         """Counts the present offset as the usual one, if both are known."""
         self._usual_m += self.shift_m
-        self.shift_m *= 0.0
+        self.shift_m *= 0.0  # NaN stays NaN
+
+    def _is_beyond(self, value_m: float, limit_m: float) -> bool:
+        """Whether a figure is beyond its limit, which grows with the noise of the pictures kept. A NaN is not."""
+        if not abs(value_m) > limit_m:
+            return False
+        steps = sorted(abs(after - before) for before, after in itertools.pairwise(self._offsets))
+        return abs(value_m) > limit_m * max(1.0, steps[PICTURES // 2 - 1] / (MEDIAN_STEP * NOISE_M))
 
     def _told_at(self, time_ns: int) -> float:
         """Depth by the sensor at a time between two readings, m; NaN elsewhere."""

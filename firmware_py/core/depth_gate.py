@@ -41,7 +41,8 @@ DOUBT = 25
 """Readings, half a second of DEPTH frames: so many refused ones more than accepted ones make a sensor distrusted, so many steady ones with
 none near between them show an offset, and so many accepted ones make it trusted again. Half of the limit of the fail-safe `depth_lost`."""
 NEAR_SHARE = 0.5
-"""Share of the gate within which a reading is near. A sensor at the edge of the gate has every other reading refused, and no near one."""
+"""Share of the gate within which a reading is near: 2.5 sigmas of the innovation, beyond which one reading in 80 is by chance. A sensor at
+the edge of the gate has every other reading refused, and no near one."""
 
 
 class DepthGate:
