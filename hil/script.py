@@ -167,10 +167,12 @@ def _waypoints(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
 
 
 def _infeasible(error: ValueError, task: Task) -> DescriptionError:
-    """The error for a file whose path cannot be flown: with the line of the waypoint at which a piece ends that is too fast."""
-    if not isinstance(error, InfeasibleError) or error.piece is None:
+    """The error for a file whose path cannot be flown: with the line of the waypoint that cannot be held, or that ends a piece."""
+    if not isinstance(error, InfeasibleError):
         return DescriptionError(f"{task.file}: {error}")
-    return DescriptionError(f"{task.file}:{line_of(task.file_text, task.file, error.piece + 1)}: {error}; allow more time")
+    stands = error.place.time_s is None
+    line = line_of(task.file_text, task.file, error.place.waypoint + (not stands))
+    return DescriptionError(f"{task.file}:{line}: {error}{'' if stands else '; allow more time'}")
 
 
 def _refuse_unbounded(mission: Mission, file: str) -> None:

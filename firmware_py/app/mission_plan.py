@@ -10,7 +10,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import Setpoint
-from firmware_py.ground.mission_flight import Leg, Plan, PlanJob
+from firmware_py.ground.mission_flight import GO_TO, Leg, Plan, PlanJob
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, distinct, plan
 from firmware_py.prepare.piecewise import Piecewise
 
@@ -57,7 +57,11 @@ def plan_mission(job: PlanJob, body: Body | None, wanted: Callable[[], bool] = l
                 arrivals += [at_s] * len(section)
             p_wb, q_wb = _end(points)
             at_s += section[-1].hold_s
-    except (InfeasibleError, ValueError) as error:
+    except InfeasibleError as error:
+        leg = next((leg for leg, place in zip(section, places, strict=True) if place > error.place.waypoint), section[-1])
+        target = "there" if leg.sequence == GO_TO else f"to item {leg.sequence}"
+        return Plan(job.serial, None, (), error.worded(f"on the way {target}"))
+    except ValueError as error:
         return Plan(job.serial, None, (), str(error))
     except UnwantedError:
         return Plan(job.serial, None, (), "nobody waits for it any more")

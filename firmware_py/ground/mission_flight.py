@@ -35,7 +35,7 @@ _SETTLE_TICKS = 3
 _HOLD_TICKS = 100
 """Ticks from the request of a hold until it must be in force; ticks queued while the loop took the request count too."""
 _REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
-_GO_TO = -1
+GO_TO = -1
 """Sequence number of a leg that belongs to no mission."""
 _PRESENT = -1
 """DO_SET_MISSION_CURRENT's number for the current item."""
@@ -99,7 +99,7 @@ class _Flight:
     @property
     def of_mission(self) -> bool:
         """Whether the flight belongs to a mission, rather than going to a single place."""
-        return self.legs[0].sequence != _GO_TO
+        return self.legs[0].sequence != GO_TO
 
 
 class MissionFlight:
@@ -229,7 +229,7 @@ class MissionFlight:
         if s.progress.state == ACTIVE:
             self._end(PAUSED)
         turned = yaw if math.isfinite(yaw) else None
-        self._begin((Leg(_GO_TO, place, turned, 0.0, speed_m_s if speed_m_s > 0 else math.nan),))
+        self._begin((Leg(GO_TO, place, turned, 0.0, speed_m_s if speed_m_s > 0 else math.nan),))
         return ""
 
     # ------------------------------------------------------------ events
@@ -333,14 +333,14 @@ class MissionFlight:
         while flight.reached < len(flight.legs) and t >= flight.arrivals_s[flight.reached]:
             sequence = flight.legs[flight.reached].sequence
             flight.reached += 1
-            if sequence != _GO_TO and not flight.replaced:
+            if sequence != GO_TO and not flight.replaced:
                 self._system.broadcast("MISSION_ITEM_REACHED", {"seq": sequence})
                 self._repeat = [(sequence, time_ns + n * _REACHED_EVERY_NS) for n in range(1, _REACHED_REPEATS)]
                 if flight.reached < len(flight.legs):
                     p.current = flight.legs[flight.reached].sequence
         last = flight.legs[-1]
         if flight.reached == len(flight.legs) and t >= flight.arrivals_s[-1] + last.hold_s:
-            if last.sequence != _GO_TO:
+            if last.sequence != GO_TO:
                 self._system.say(INFORMATION, "mission complete")
             self._end(DONE)
 

@@ -14,7 +14,7 @@ import numpy as np
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
 from firmware_py.prepare.piecewise import Piecewise
-from firmware_py.prepare.snap_limits import InfeasibleError, Limits, Place, crests, place_on, planes, solve_limited, worst
+from firmware_py.prepare.snap_limits import InfeasibleError, Limits, Place, crests, planes, solve_limited, worst
 from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
 from firmware_py.prepare.snap_thrust import divide, sag, usage
 
@@ -80,7 +80,7 @@ def plan(
 ) -> Piecewise:
     """The trajectory of least snap through the waypoints, rest to rest.
 
-    Equal neighbours are merged and count once in `breaks` and messages, unless a duration is given for each piece.
+    Equal neighbours are merged and count once in `breaks`, unless a duration is given for each piece.
 
     Args:
         waypoints: two or more.
@@ -98,8 +98,24 @@ def plan(
     """
     limits = limits or Limits()
     _check(waypoints)
-    if not isinstance(durations_s, Sequence | np.ndarray):
-        waypoints, _ = distinct(waypoints)
+    if isinstance(durations_s, Sequence | np.ndarray):
+        return _plan(waypoints, durations_s, limits, body, stretch, wanted)
+    merged, own = distinct(waypoints)
+    try:
+        return _plan(merged, durations_s, limits, body, stretch, wanted)
+    except InfeasibleError as error:
+        raise error.renumbered(len(own) - 1 - own[::-1].index(min(error.place.waypoint, own[-1]))) from None
+
+
+def _plan(
+    waypoints: Sequence[Waypoint],
+    durations_s: Sequence[float] | float | None,
+    limits: Limits,
+    body: Body | None,
+    stretch: bool,
+    wanted: Callable[[], bool],
+) -> Piecewise:
+    """The trajectory through waypoints that are merged where they may be; see `plan`."""
     request = _Request.of(waypoints if len(waypoints) > 1 else [*waypoints, *waypoints], limits, body, wanted)
     base = request.durations(durations_s)
     if durations_s is not None and not stretch:
@@ -262,15 +278,14 @@ class _Request:
         """Refuses a grid (pieces, points, 20) that turns too far or too fast; `place` as for `_check_motion`."""
         if (shortest := float(grid[..., 19].min())) < _SHORTEST_QUATERNION:
             where = place(int(np.argmin(grid[..., 19])))
-            raise InfeasibleError(f"attitude turns too far {where.words} (length {shortest:.2f}); add a waypoint there", where.piece)
+            raise InfeasibleError("attitude turns too far", where, f" (length {shortest:.2f}); add a waypoint there")
         rate, change = self.limits.angular_rate, self.limits.angular_acceleration
         for bound, columns, unit in ((rate, slice(10, 13), "rad/s"), (change, slice(16, 19), "rad/s^2")):
             if bound is None:
                 continue
             largest, at = _largest(np.linalg.norm(grid[..., columns], axis=-1))
             if largest > bound:
-                where = place(at)
-                raise InfeasibleError(f"turning takes {largest:.3g} {unit} of at most {bound:g} {unit} {where.words}", where.piece)
+                raise InfeasibleError(f"turning takes {largest:.3g} {unit} of at most {bound:g} {unit}", place(at))
 
     def check_standing(self) -> None:
         """Refuses attitudes that the body cannot hold even at rest. Raises InfeasibleError."""
@@ -278,7 +293,7 @@ class _Request:
             return
         still = np.zeros((len(self.attitude.value), 19))
         still[:, 3:7] = self.attitude.value
-        self._check_motion(self.body, still, lambda k: Place(f"to stand still at waypoint {k}"))
+        self._check_motion(self.body, still, Place)
 
     def _check_motion(self, body: Body, motion: np.ndarray, place: Callable[[int], Place], run: int = 1) -> None:
         """Refuses (k, 19) motion that needs more than thrusters and buoyancy give; `place` describes where row k is.
@@ -290,20 +305,16 @@ class _Request:
         k, axis = divmod(flat, 6)
         if lacking := abs(float(part.lacking[k, axis])):
             what = f"{lacking:.2g} {'N along' if axis < 3 else 'N m about'} the robot's {'xyz'[axis % 3]}"
-            where = place(k)
-            raise _UnreachableError(f"neither thrusters nor buoyancy give {what}, which it takes {where.words}", where.piece)
+            raise _UnreachableError(f"neither thrusters nor buoyancy give {what}, which it takes", place(k))
         if (falling := np.flatnonzero(np.isinf(part.lean))).size:
-            where = place(int(falling[0]))
-            raise InfeasibleError(f"neither thrusters nor buoyancy keep the robot from falling over {where.words}", where.piece)
+            raise InfeasibleError("neither thrusters nor buoyancy keep the robot from falling over", place(int(falling[0])))
         lean, k = _largest(part.lean.reshape(-1, run))
         if lean > MOST_LEAN:
             degrees = f"{math.degrees(lean):.1f} deg, of at most {math.degrees(MOST_LEAN):.1f} deg"
-            where, what = place(k), "for a moment that its thrusters do not give"
-            raise InfeasibleError(f"the robot would lean by {degrees}, {what}, {where.words}", where.piece)
+            raise InfeasibleError(f"the robot would lean by {degrees}, for a moment that its thrusters do not give,", place(k))
         share, k = usage(body, part.thrust, self.limits.thruster_share, sag(part.thrust, run))
         if share > self.limits.thruster_share:
-            where = place(k)
-            raise InfeasibleError(_thrust_message(share, self.limits.thruster_share, where.words), where.piece)
+            raise InfeasibleError(_thrust_message(share, self.limits.thruster_share), place(k))
 
 
 def _check(waypoints: Sequence[Waypoint]) -> None:
@@ -324,9 +335,9 @@ def _velocity(waypoints: Sequence[Waypoint], k: int) -> np.ndarray | None:
     return np.zeros(3) if _rests(waypoints, k) else waypoints[k].velocity_w
 
 
-def _thrust_message(share: float, limit: float, where: str) -> str:
+def _thrust_message(share: float, limit: float) -> str:
     used, allowed = f"{100.0 * share:.0f} %" if share < HOPELESS else f"more than {100.0 * HOPELESS:.0f} %", f"{100.0 * limit:.0f} %"
-    return f"the thrusters would be used to {used} of their range, of at most {allowed}, {where}"
+    return f"the thrusters would be used to {used} of their range, of at most {allowed},"
 
 
 def _largest(size: np.ndarray) -> tuple[float, int]:
@@ -345,7 +356,7 @@ def _place(found: Piecewise, fine: Piecewise, flat: int) -> Place:
     part, i = divmod(flat, _CHECK_POINTS + 1)
     time = fine.breaks[part] + i / _CHECK_POINTS * (fine.breaks[part + 1] - fine.breaks[part])
     piece = int(np.searchsorted(found.breaks, fine.breaks[part], side="right")) - 1
-    return place_on(piece, float(time))
+    return Place(piece, float(time))
 
 
 def _continuous(waypoints: Sequence[Waypoint]) -> np.ndarray:

@@ -11,7 +11,7 @@ import itertools
 import math
 from contextlib import redirect_stdout
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 import osqp
@@ -46,22 +46,45 @@ _CORRIDOR_SIDES = 8
 
 
 class Place(NamedTuple):
-    """Where a path does not meet a request, in words, and the index of the piece; None for a place that is on no piece."""
+    """Where a path does not meet a request.
 
-    words: str
-    piece: int | None = None
+    Attributes:
+        waypoint: index of the waypoint where it is, or behind which.
+        time_s: time since the start of the path; None at the waypoint itself, at rest.
+    """
+
+    waypoint: int
+    time_s: float | None = None
+
+    def __str__(self) -> str:
+        if self.time_s is None:
+            return f"to stand still at waypoint {self.waypoint}"
+        return f"between waypoints {self.waypoint} and {self.waypoint + 1}, at {self.time_s:.2f} s"
 
 
 class InfeasibleError(ValueError):
-    """No trajectory meets the request; the message says which limit, and where.
+    """No trajectory meets the request; the message says which limit, where, and what follows.
 
     Attributes:
-        piece: index of the piece that does not meet it, the one from waypoint `piece` to the next; None where it is no single one.
+        place: where the request is not met.
     """
 
-    def __init__(self, message: str, piece: int | None = None) -> None:
-        super().__init__(message)
-        self.piece = piece
+    def __init__(self, what: str, place: Place, rest: str = "") -> None:
+        super().__init__(what, place, rest)
+        self.place = place
+
+    def __str__(self) -> str:
+        return self.worded(str(self.place))
+
+    def worded(self, where: str) -> str:
+        """The message with other words for the place."""
+        what, _, rest = self.args
+        return f"{what} {where}{rest}"
+
+    def renumbered(self, waypoint: int) -> Self:
+        """The same error with another index for the waypoint."""
+        what, place, rest = self.args
+        return type(self)(what, place._replace(waypoint=waypoint), rest)
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,24 +211,18 @@ def crests(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return at + 0.5 * slope * offset, np.arange(1, values.shape[-1] - 1) + offset
 
 
-def worst(limits: list[Plane], coefficients: np.ndarray, durations: np.ndarray) -> tuple[float, Place]:
-    """Largest ratio of any limited quantity to its limit, and that limit and its place in words; 0 without limits."""
+def worst(limits: list[Plane], coefficients: np.ndarray, durations: np.ndarray) -> tuple[float, str, Place]:
+    """Largest ratio of any limited quantity to its limit, the name of that limit, and its place; 0 without limits."""
     if not limits:
-        return 0.0, Place("")
+        return 0.0, "", Place(0)
     excess, where = _Table.of(limits).excess(coefficients, durations)
     k = int(np.argmax(excess))
-    return float(excess[k]), _limit_at(limits[k], float(where[k]), durations)
+    return float(excess[k]), limits[k].name, _place_on(limits[k].piece, float(where[k]), durations)
 
 
-def place_on(piece: int, time_s: float) -> Place:
-    """The place on a piece at `time_s` since the start of the path."""
-    return Place(f"between waypoints {piece} and {piece + 1}, at {time_s:.2f} s", piece)
-
-
-def _limit_at(plane: Plane, u: float, durations: np.ndarray) -> Place:
-    """A limit at the share `u` of its piece."""
-    place = place_on(plane.piece, float(durations[: plane.piece].sum() + u * durations[plane.piece]))
-    return place._replace(words=f"{plane.name} {place.words}")
+def _place_on(piece: int, u: float, durations: np.ndarray) -> Place:
+    """The place at the share `u` of a piece."""
+    return Place(piece, float(durations[:piece].sum() + u * durations[piece]))
 
 
 def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.ndarray) -> np.ndarray:
@@ -220,10 +237,10 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
     Raises:
         InfeasibleError: names the limit and the place of the conflict.
     """
+    in_time = f"in {system.durations.sum():.2f} s"
     if knots.fixed.all():
-        _, what = worst(limits, system.coefficients(knots.value, start), system.durations)
-        message = f"no trajectory in {system.durations.sum():.2f} s that stops at every waypoint keeps the {what.words}"
-        raise InfeasibleError(message, what.piece)
+        _, name, place = worst(limits, system.coefficients(knots.value, start), system.durations)
+        raise InfeasibleError(f"no trajectory {in_time} that stops at every waypoint keeps the {name}", place)
     table = _Table.of(limits)
     problem = _Problem(system, knots, start)
     index = np.repeat(np.arange(len(limits)), _FIRST_POINTS)
@@ -232,13 +249,13 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
         try:
             unknown, conflict = problem.solve(table, index, where)
         except (osqp.OSQPException, _GaveUpError) as error:
-            _, what = worst(limits, system.coefficients(knots.value, start), system.durations)
+            _, name, place = worst(limits, system.coefficients(knots.value, start), system.durations)
             why = "" if isinstance(error, _GaveUpError) else "error "
-            message = f"no trajectory was found that keeps the {what.words}: OSQP gave up with {why}{error}"
-            raise InfeasibleError(message, what.piece) from None
+            raise InfeasibleError(f"no trajectory was found that keeps the {name}", place, f": OSQP gave up with {why}{error}") from None
         if conflict >= 0:
-            what = _limit_at(limits[index[conflict]], float(where[conflict]), system.durations)
-            raise InfeasibleError(f"no trajectory in {system.durations.sum():.2f} s keeps the {what.words}", what.piece)
+            limit = limits[index[conflict]]
+            place = _place_on(limit.piece, float(where[conflict]), system.durations)
+            raise InfeasibleError(f"no trajectory {in_time} keeps the {limit.name}", place)
         excess, crest = table.excess(system.coefficients(knots.value, unknown), system.durations)
         broken = np.flatnonzero(excess > 1.0)
         if not len(broken):
@@ -246,8 +263,8 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
         index = np.concatenate([index, broken])
         where = np.concatenate([where, crest[broken]])
     k = int(np.argmax(excess))
-    what = _limit_at(limits[k], float(crest[k]), system.durations)
-    raise InfeasibleError(f"no trajectory was found in {_ROUNDS} rounds that keeps the {what.words}", what.piece)
+    place = _place_on(limits[k].piece, float(crest[k]), system.durations)
+    raise InfeasibleError(f"no trajectory was found in {_ROUNDS} rounds that keeps the {limits[k].name}", place)
 
 
 class _GaveUpError(Exception):

@@ -106,7 +106,7 @@ def test_attitude_that_cannot_be_held_is_refused_at_once() -> None:
     waypoints = [Waypoint(np.zeros(3)), Waypoint(np.array([1.0, 0, 0]), rotations.from_euler(math.pi / 2, 0.0, 0.0))]
     with pytest.raises(InfeasibleError, match="to stand still at waypoint 1") as refused:
         plan(waypoints, [10.0], body=assemble_vehicle(heavy))
-    assert refused.value.piece is None
+    assert refused.value.place == (1, None)
 
 
 @pytest.mark.slow

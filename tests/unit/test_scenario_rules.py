@@ -341,6 +341,17 @@ def test_path_that_does_not_fit_is_refused_before_the_flight(tmp_path: Path, nam
     assert "\n" not in str(refused.value)
 
 
+def test_refusal_names_the_line_of_a_waypoint_behind_one_that_is_there_twice(tmp_path: Path) -> None:
+    text = PATH_TOML.replace("\n[limits]", "duration_s = 9.0\n[limits]", 1)
+    first = "[[waypoint]]" + text.split("[[waypoint]]")[1]
+    lines = []
+    for written in (text, text.replace(first, first + first, 1)):
+        with pytest.raises(DescriptionError, match=r"no trajectory in 9\.00 s") as refused:
+            flown(waypoints(tmp_path, written, "path.toml"))
+        lines.append(int(str(refused.value).split("path.toml:")[1].split(":")[0]))
+    assert lines[1] - lines[0] == first.count("\n")
+
+
 def test_points_without_durations_are_refused_with_what_their_file_can_give(tmp_path: Path) -> None:
     text = "x_m,y_m,z_m\n-0.3,-0.25,0.55\n0.1,-0.2,0.5\n"
     with pytest.raises(DescriptionError, match=r"path\.csv: has no durations; add the column duration_s, or write a \.toml with"):
