@@ -34,10 +34,23 @@ def flight_progress(title: str, duration_s: float, console: Console | None = Non
 
 @contextmanager
 def campaign_progress(title: str, trials: int, console: Console | None = None) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar over trials; yields a function that takes the number of trials flown and the total."""
+    """A progress bar over trials, or a line after each tenth if the output is not a terminal.
+
+    Yields a function that takes the number of trials flown and the total.
+    """
+    console = console or Console()
+    if not console.is_terminal:
+        yield partial(_print_tenth, console, title)
+        return
     columns = (TextColumn("{task.completed:.0f} of {task.total:.0f} flown"), TimeElapsedColumn(), TextColumn("left"), TimeRemainingColumn())
     with _bar(title, trials, columns, console) as update:
         yield lambda done, total: update(completed=done, total=total)
+
+
+def _print_tenth(console: Console, title: str, done: int, total: int) -> None:
+    """Prints how many trials are flown if this one completes another tenth of them."""
+    if 10 * done // total > 10 * (done - 1) // total:
+        console.print(f"{title}: {done} of {total} flown", highlight=False, soft_wrap=True)
 
 
 @contextmanager
