@@ -184,7 +184,7 @@ def main(
     mode: Annotated[str, typer.Option(help="method for the outline: exact, alpha or random")] = "exact",
     compare: Annotated[bool, typer.Option(help="compare the three methods (takes minutes)")] = False,
     directions: Annotated[int, typer.Option(min=10, max=100000, help="number of directions in the comparison")] = 1000,
-    out: Annotated[Path, typer.Option(help="picture file for the drag spaces")] = Path("drag_spaces.png"),
+    out: Annotated[Path, typer.Option(help="picture file for the drag spaces")] = Path("runs") / "drag_spaces.png",
     cache: Annotated[Path | None, typer.Option(help="folder for cached outlines; the user's cache by default")] = None,
 ) -> None:
     """Build drag tables, print the force in the paper's seven flow directions, draw the drag spaces."""
