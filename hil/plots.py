@@ -95,17 +95,22 @@ def overview(flight: Flight, window: Window, tank_m: np.ndarray, paper_rmse_mm: 
     rows = ((1e3 * error_m, "mm", "Position", ""), (np.degrees(angle_rad), "deg", "Attitude", passive_words(flight)))
     for row, (values, unit, what, without) in enumerate(rows):
         axes = figure.add_subplot(grid[row, 1])
-        rmse = rms(values[inside])
-        axes.plot(time_s, _once_steered(flight, values), color=TRUTH, linewidth=1.0)
-        axes.axhline(rmse, color=REFERENCE, linestyle="--", linewidth=1.2, label=f"RMSE {rmse:.2f} {unit}")
+        steered = _once_steered(flight, values)
+        axes.plot(time_s, steered, color=TRUTH, linewidth=1.0)
+        if np.isfinite(steered[inside]).mean() > 0.5:
+            rmse = rms(values[inside])
+            axes.axhline(rmse, color=REFERENCE, linestyle="--", linewidth=1.2, label=f"RMSE {rmse:.2f} {unit}")
+        elif flight.placed.any():
+            _write_across(axes, "hardly or never steered")
         if row == 0 and paper_rmse_mm is not None:
             paper = f"paper's robot, real tank: RMSE {paper_rmse_mm:g} mm"
             axes.axhline(paper_rmse_mm, color=AXIS_COLOURS[0], linestyle=":", linewidth=1.4, label=paper)
         axes.set(title=f"{what} error, truth against reference{without}", ylabel=unit)
-        axes.set_ylim(0.0, 1.3 * max(float(values[inside].max()), *(line.get_ydata()[0] for line in axes.lines[1:])))
+        axes.set_ylim(0.0, 1.3 * max([float(values[inside].max()), *(line.get_ydata()[0] for line in axes.lines[1:])]))
         _finish_time_axis(axes, flight, window, last=row == 1)
         named = {line.get_label(): line for line in axes.lines[1:]}  # modules may join and part several times
-        axes.legend(handles=list(named.values()), loc="upper right", ncols=2, fontsize=9)
+        if named:
+            axes.legend(handles=list(named.values()), loc="upper right", ncols=2, fontsize=9)
         _say_unplaced(axes, flight)
     bands = [patch for patch in figure.axes[-1].patches if patch.get_label() == NOT_JUDGED]
     if bands:

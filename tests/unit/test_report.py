@@ -204,6 +204,18 @@ def test_plots_of_a_robot_that_never_knew_its_pose_say_so(flight: Flight) -> Non
     assert set(animation(blind, scene())["error_mm"]) == {None}
 
 
+def test_overview_of_a_robot_that_was_hardly_steered_has_no_rmse_line(flight: Flight) -> None:
+    """Its reference was its estimate. The panels were empty but for the line and its number."""
+    believed = flight.firmware["p_wb"]
+    setpoint = np.concatenate([believed[:-1], believed[-1:] + 0.1])
+    drifting = dataclasses.replace(flight, firmware=flight.firmware | {"setpoint_p_wb": setpoint})
+    figure = overview(drifting, WINDOW, TANK_M, None)
+    panels = figure.axes[1:]
+    assert [text.get_text() for axes in panels for text in axes.texts] == ["hardly or never steered"] * 2
+    assert [axes.get_legend() for axes in panels] == [None] * 2
+    pyplot.close(figure)
+
+
 def test_markup_in_a_title_stays_text(flight: Flight, result: Result, tmp_path: Path) -> None:
     page = write_report(tmp_path, result, flight, scene("<script>alert(1)</script>"), []).read_text()
     assert "<script>alert" not in page
