@@ -184,6 +184,7 @@ def run_vehicle(
             raise DescriptionError(f"{out}: an e-stop was raised while this process started, by one that ran until then; start it again")
         logged.enter_context(handled(operator.stop, endings_of_a_run()))
         stack.enter_context(quiet_garbage())
+        teller.say(f"messages count modules from 0: {', '.join(f'{k} is number {fleet.label(k)}' for k in range(len(fleet.module)))}")
         teller.say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
         loop.run(operator.is_done)
         if recorder is not None and loop.last is not None:
