@@ -40,6 +40,9 @@ MOST_SPEED_M_S, DROP_SPEED_M_S = 2.0, 6.0
 DOUBT = 25
 """Readings, half a second of DEPTH frames: so many refused ones more than accepted ones make a sensor distrusted, so many steady ones with
 none near between them show an offset, and so many accepted ones make it trusted again. Half of the limit of the fail-safe `depth_lost`."""
+SETTLED = 100
+"""Readings, two seconds of DEPTH frames, without a jump, after which a body that does not fly believes a sensor that had jumped: after a
+silence, or a false first reading, nothing else would give the depth back without tags."""
 NEAR_SHARE = 0.5
 """Share of the gate within which a reading is near: 2.5 sigmas of the innovation, beyond which one reading in 80 is by chance. A sensor at
 the edge of the gate has every other reading refused, and no near one."""
@@ -99,7 +102,7 @@ class DepthGate:
         sensor, told_m = self._sensors[index], (pressure_pa - ATMOSPHERE_PA) / PA_PER_M
         sensor.hear(time_ns, told_m, MOST_SPEED_M_S if armed else DROP_SPEED_M_S)
         if expected is None:
-            return sensor.is_continuous()
+            return sensor.is_continuous(armed)
         below_m = sum(r * down for r, down in zip(self._r_bi[index], expected.down_b, strict=True))
         error_m = told_m - below_m - expected.depth_m
         most_m = MOST_STEP_M if armed and sensor.was_trusted else math.inf
@@ -122,20 +125,29 @@ class _Sensor:
         self._doubt, self._steady, self._low, self._high = 0, 0, 0.0, 0.0
         self._last_m, self._last_ns, self._jumped_m = math.nan, 0, 0.0
         """Last possible reading, and how far the sensor has jumped since it last agreed with tags or came back."""
+        self._unbroken, self._only_jumped = 0, False
+        """Readings since it last jumped; whether a jump is all that it is distrusted for."""
 
     def hear(self, time_ns: int, depth_m: float, speed_m_s: float) -> None:
         """Notes a possible reading, and whether the sensor jumped to it: farther than a body goes at `speed_m_s` since the one before."""
         self.datum.hear(time_ns, depth_m)
         moved_m, most_m = depth_m - self._last_m, min(LEAST_GATE_M + speed_m_s * 1e-9 * (time_ns - self._last_ns), MOST_STEP_M)
+        self._unbroken += 1
         if abs(moved_m) > most_m:
+            self._unbroken = 0
             self._jumped_m += moved_m
             self._jumped_m = self._jumped_m if abs(self._jumped_m) > most_m else 0.0
         self._last_m, self._last_ns = depth_m, time_ns
 
-    def is_continuous(self) -> bool:
-        """Whether a reading without tags may be used: the sensor is trusted, and has not jumped."""
+    def is_continuous(self, armed: bool) -> bool:
+        """Whether a reading without tags may be used: the sensor is trusted, and has not jumped, or has settled while the body rests."""
         if self._jumped_m:
+            self._only_jumped = self._only_jumped or not self.is_distrusted
             self._count_doubt()
+        if not armed and self._unbroken >= SETTLED:
+            self._jumped_m = 0.0
+            if self._only_jumped:
+                self._doubt, self.is_distrusted = 0, False
         return not self.is_distrusted and not self._jumped_m
 
     def agrees(self, error_m: float, gate_m: float, most_m: float) -> bool:
@@ -151,8 +163,10 @@ class _Sensor:
         return not self.is_distrusted
 
     def _differ(self, error_m: float, gate_m: float, most_m: float) -> None:
-        """Notes a reading outside the gate, or of a sensor that drifts."""
-        self._count_doubt()
+        """Notes a reading outside the gate, which is doubtful, or of a sensor that drifts or follows waves, which is not yet."""
+        self._only_jumped = False
+        if abs(error_m) > gate_m:
+            self._count_doubt()
         self._low, self._high = (min(self._low, error_m), max(self._high, error_m)) if self._steady else (error_m, error_m)
         if self._high - self._low > gate_m:
             self._steady, self._low, self._high = 0, error_m, error_m

@@ -126,7 +126,7 @@ class Estimator:
 
         Without tags a push carries the body away from the estimate within half a second, and the depth sensors are right.
         """
-        if self._accepted < READY_AFTER or time_ns - self._last_tag_ns > BLIND_NS:
+        if not self._accepted or time_ns - self._last_tag_ns > BLIND_NS:
             return None
         sigma_m = math.sqrt(self._depth_variance + self._head.covariance[24, 24] + self._p.depth_sigma_m**2)
         return ExpectedDepth(float(self._now[2] + self._now[25]), sigma_m, to_matrix(self.q_wb)[2].tolist())
@@ -196,6 +196,7 @@ class Estimator:
         x[3:7] = pose.q_wb
         x[:3] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
         x[29:] = down_of(x)
+        self._history.forget_depths(float(x[2]), 5.0 * INITIAL_SIGMA[-1])
         inertia = np.diag(self._body.mass)
         sigma = np.r_[np.repeat(np.array(INITIAL_SIGMA), [3, 3, 3, 3, 3, 3, 3, 3, 1]), self._body.righting_sigma]
         sigma[18:24] *= inertia

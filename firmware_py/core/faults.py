@@ -37,6 +37,9 @@ FAST_SHARE = 2.0
 """A propeller does not obey if it turns faster than this multiple of its believed speed plus `FAST_MARGIN`."""
 FAST_MARGIN = 0.25
 """Margin for a speed that is too high or of the wrong sign, as a share of full speed: deadband and lag explain smaller deviations."""
+STANDSTILL = 1.45
+"""Multiple of the deadband in the vehicle file up to which a healthy propeller may stand still; deadbands differ from thruster to thruster,
+on the bench from 0.10 to 0.25 N where the file says 0.17."""
 CLEAR = 4.0
 """A repeated standstill counts twice where the believed force is at least this many times the least judged force: the propeller is not
 just about to start."""
@@ -119,7 +122,7 @@ class FaultDetector:
 
     def retune(self, parameters: Faults) -> None:
         """Applies new limits from this tick on; known faults stay."""
-        self._limits = parameters.force_n, parameters.dead_share
+        self._limits = np.maximum(parameters.force_n, STANDSTILL * self._t.deadband_n), parameters.dead_share
         self._needed = np.array([parameters.dead_count, parameters.dead_count, parameters.stray_count])
         self._motion.parameters = parameters
 
@@ -272,14 +275,14 @@ def believed_rpm(force_n, full_n, rpm_at_full):  # type: ignore[no-untyped-def]
     return math.copysign(rpm_at_full * math.sqrt(abs(force_n) / full_n[0 if force_n > 0.0 else 1]), force_n)
 
 
-@njit(f"boolean(float64[:,:,::1],{V},boolean[::1],{M},{V},float64,float64,int64[::1],int64[:,::1],{M},{V})", cache=True)
+@njit(f"boolean(float64[:,:,::1],{V},boolean[::1],{M},{V},{V},float64,int64[::1],int64[:,::1],{M},{V})", cache=True)
 def count_feedback(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, needed, counts, heard, share):  # type: ignore[no-untyped-def]
     """Updates fault counts and force shares from ESC feedback; returns whether any thruster has shown a fault often enough.
 
     Args:
         feedback: (k, 3, 2) per frame the indices (-1: none), speeds 1/min and EscStatus of its two thrusters.
         force_n, alive, full_n, rpm_at_full: per thruster believed force, whether usable, full forces (n, 2), full speed.
-        least_n: smallest believed force at which a standstill is judged, N; dead_share: the parameter.
+        least_n: (n,) smallest believed force at which a standstill is judged, N; dead_share: the parameter.
         needed: (3,) feedbacks in a row that suffice for ESC_FAILED, STALLED, WRONG_SPEED.
         counts: (n, 3) feedbacks in a row that showed ESC_FAILED, STALLED, WRONG_SPEED; a clear STALLED after another one counts twice.
         heard: (n, 2) running means of reported times believed force, and of believed force squared, any unit.
@@ -300,8 +303,9 @@ def count_feedback(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_
             stands = abs(rpm) < dead_share * abs(believed)
             wrong_way = rpm * believed < 0.0 and not stands and abs(rpm - believed) > margin
             count[ESC_FAILED] = count[ESC_FAILED] + 1 if status in ESC_DOWN else 0
-            if abs(force_n[i]) >= least_n:
-                count[STALLED] = count[STALLED] + (2 if count[STALLED] > 0 and abs(force_n[i]) >= CLEAR * least_n else 1) if stands else 0
+            if abs(force_n[i]) >= least_n[i]:
+                step = 2 if count[STALLED] > 0 and abs(force_n[i]) >= CLEAR * least_n[i] else 1
+                count[STALLED] = count[STALLED] + step if stands else 0
             count[WRONG_SPEED] = count[WRONG_SPEED] + 1 if wrong_way or abs(rpm) > FAST_SHARE * abs(believed) + margin else 0
             for kind in range(len(WHY)):
                 found = found or count[kind] >= needed[kind]

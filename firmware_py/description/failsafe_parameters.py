@@ -242,7 +242,8 @@ class Faults:
 
     force_n: float = quantity(
         0.25, unit="N", low=0.05, high=10,
-        help="smallest modelled thruster force at which a propeller that stands still counts as faulty", mavlink="FLT_FORCE"
+        help="smallest modelled thruster force at which a propeller that stands still counts as faulty; at least 1.45 deadbands",
+        mavlink="FLT_FORCE",
     )
     dead_share: float = quantity(
         0.45, low=0.05, high=0.95, help="share of the expected speed below which a propeller counts as standing still", mavlink="FLT_DEAD"

@@ -1,8 +1,11 @@
 """The paper's complete spiral with the acceptance limits of one seed; all twenty seeds belong to `make accept`."""
 
+import dataclasses
+
 import pytest
 
 from firmware_py.description.parameters import CONTROLLERS
+from firmware_py.description.vehicle import load_vehicle
 from hil.scenario import load_scenario
 from tests.closed_loop.flights import Fly
 
@@ -36,6 +39,18 @@ def test_heavy_bluerov_flies_the_same_spiral_a_hand_from_the_walls(fly: Fly, see
     """Its drag per kilogram is ten times the module's, so the current disturbs it ten times as much."""
     result = fly(load_scenario("spiral").with_vehicle("bluerov2_heavy"), seed)
     assert result.passed
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("vehicle", ["bluerov2", "bluerov2_heavy"])
+def test_thruster_that_stands_still_within_the_deadband_of_its_vehicle_is_not_left_out(fly: Fly, vehicle: str) -> None:
+    """One to three of them were in a hover, and the robot held its place to 0.2 m: what counted as a standstill suited a modcube only."""
+    scenario = load_scenario("hover").with_vehicle(vehicle)
+    deadband_n = load_vehicle(vehicle).curve.deadband_n
+    world = dataclasses.replace(scenario.world, deadband_low_n=0.97 * deadband_n, deadband_high_n=1.05 * deadband_n)
+    result = fly(dataclasses.replace(scenario, world=world), 0)
+    assert result.passed
+    assert result.metrics["warnings"] == 0
 
 
 def test_scenario_says_what_the_issue_asks_of_the_spiral() -> None:

@@ -1,12 +1,13 @@
 """Pressure that cannot be, or that contradicts the tags, is not believed: a false one would take the robot to the surface."""
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
 
-from firmware_py.core.depth_gate import DOUBT, LEAST_GATE_M, MOST_SPEED_M_S, MOST_STEP_M, PA_PER_M, DepthGate
+from firmware_py.core.depth_gate import DOUBT, LEAST_GATE_M, MOST_SPEED_M_S, MOST_STEP_M, PA_PER_M, SETTLED, DepthGate
 from firmware_py.core.measurements import ATMOSPHERE_PA
 from firmware_py.core.types import ExpectedDepth, Mode, ModuleInputs
 from firmware_py.description.vehicle import load_vehicle
@@ -108,6 +109,24 @@ def test_sensor_that_jumped_without_tags_for_half_a_second_is_distrusted_until_t
     assert told(gate, [3.0], None) == [3.0]
 
 
+@pytest.mark.parametrize("jumped", [1, 2 * DOUBT])
+def test_body_that_rests_believes_a_sensor_that_jumped_once_it_has_settled(jumped: int) -> None:
+    """After a silence nothing but tags gave the depth back, and a false first reading made every right one a jump."""
+    gate = trusted()
+    told(gate, [8.0] * jumped, None)
+    assert told(gate, [8.0] * 2 * SETTLED, None)[-1] is None, "an armed one does not"
+    assert told(gate, [8.0], None, armed=False) == [8.0]
+    gate = DepthGate(single())
+    assert told(gate, [3.15] + [3.0] * 2 * SETTLED, None, armed=False)[-1] == 3.0
+
+
+def test_rest_does_not_clear_a_sensor_that_contradicted_tags() -> None:
+    gate = trusted()
+    told(gate, [8.0] * DOUBT)
+    told(gate, [12.0] * DOUBT, None)
+    assert told(gate, [12.0] * 2 * SETTLED, None, armed=False)[-1] is None
+
+
 def test_sensor_that_jumped_just_before_the_tags_went_is_not_used_without_them() -> None:
     gate = trusted()
     told(gate, [8.0] * (DOUBT // 2))
@@ -198,6 +217,17 @@ def with_pressure(change: Callable[[float, int], float], mode: Mode, seconds: fl
     return tank, farthest
 
 
+def lose_tags(tank: Tank) -> None:
+    hear = tank._hear
+
+    def blind(tick: int) -> list[ModuleInputs]:
+        (module,) = hear(tick)
+        module.tags = []
+        return [module]
+
+    tank._hear = blind  # type: ignore[method-assign]
+
+
 WRONG: dict[str, Callable[[float, int], float]] = {
     "reads nothing": lambda _, tick: float(tick % 7),
     "reads its limit": lambda _, tick: 1.04e6 + tick % 7,
@@ -230,12 +260,39 @@ def test_robot_keeps_its_depth_when_the_weather_changes_at_once(offset_pa: float
 
 def test_robot_that_loses_the_tags_with_a_false_pressure_comes_up_as_one_that_knows_no_depth() -> None:
     tank, _ = with_pressure(WRONG["5 m too deep"], Mode.ALT_HOLD, 2.0)
+    lose_tags(tank)
+    assert tank.run(7.0).records[0].mode == Mode.SURFACE
+
+
+@pytest.mark.parametrize("offset_m", [-3.5, 5.0, 19.5])
+@pytest.mark.parametrize("blind_s", [0.0, 5.0])
+def test_first_tags_give_a_pose_whatever_the_pressure_sensor_tells(offset_m: float, blind_s: float) -> None:
+    """A broken one, or a lake at 3800 m: readings from before the first tags pulled the filter off, and it refused the tags for ever."""
+    tank = Tank([single()])
     hear = tank._hear
 
-    def blind(tick: int) -> list[ModuleInputs]:
+    def false(tick: int) -> list[ModuleInputs]:
         (module,) = hear(tick)
-        module.tags = []
+        if module.pressure_pa is not None:
+            module.pressure_pa += offset_m * PA_PER_M
+        if tick * DT < blind_s:
+            module.tags = []
         return [module]
 
-    tank._hear = blind  # type: ignore[method-assign]
-    assert tank.run(7.0).records[0].mode == Mode.SURFACE
+    tank._hear = false  # type: ignore[method-assign]
+    estimate = tank.run(blind_s + 1.0).records[0].estimate
+    assert estimate.ready and estimate.rejected <= 1
+    assert abs(estimate.p_wb[2] - tank.states[0][2]) < 0.01
+
+
+@pytest.mark.parametrize(("height_m", "period_s"), [(0.03, 4.0), (0.05, 2.0), (0.05, 4.0)])
+def test_robot_in_small_waves_keeps_holding_its_depth_when_the_tags_go(height_m: float, period_s: float) -> None:
+    """The sensor erred by less than the gate, and was distrusted for it; without tags the robot surfaced."""
+
+    def waves(pressure_pa: float, tick: int) -> float:
+        return pressure_pa + height_m * PA_PER_M * math.sin(2.0 * math.pi * tick * DT / period_s)
+
+    tank, farthest = with_pressure(waves, Mode.ALT_HOLD, 10.0)
+    assert farthest < 0.03
+    lose_tags(tank)
+    assert tank.run(7.0).records[0].mode == Mode.ALT_HOLD
