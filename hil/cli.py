@@ -50,17 +50,22 @@ def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
     """The scenario `name` with the changes from the command line. Raises DescriptionError."""
     from hil.bench import fleet_of
     from hil.scenario import load_scenario
+    from hil.scenario_rules import mistakes
     from hil.script import mistake_of_flight
 
     scenario = load_scenario(name)
+    file = Path(name) if name.endswith(".toml") else scenario_file(name)
     if sensors not in ("real", "ideal"):
         raise DescriptionError(f"sensors {sensors!r} is unknown; there are real, ideal")
     if sensors == "ideal":
         scenario = scenario.with_ideal_sensors()
     if vehicle:
         scenario = scenario.with_vehicle(vehicle)
+        if (mistake := next(mistakes(scenario), None)) is not None:
+            keys, what = mistake
+            raise read_toml(file)[1].error(keys, f"{what} (--vehicle {vehicle})")
     if name.endswith(".toml") and (mistake := mistake_of_flight(scenario, fleet_of(scenario, DEFAULT_BUS, 100))):
-        raise read_toml(Path(name))[1].error(*mistake)
+        raise read_toml(file)[1].error(*mistake)
     return scenario
 
 

@@ -187,13 +187,14 @@ REALTIME = pytest.param(["--realtime", "--bus", "udp:239.74.163.9:43127"], marks
     ("old", "new", "options", "why"),
     [
         ("", "", ["--vehicle", "nautilus"], "vehicle 'nautilus' is unknown"),
+        ("", "", ["--vehicle", "girona500"], "girona500, 1.5 x 1 x 1 m as it starts, does not fit that tank: take a larger tank or a sm"),
         ("", "", ["--vehicle", "no_mesh.toml"], "none.stl: there is no such mesh"),
         ("", "", ["--rate", "120"], "--rate 120"),
         ("", "", ["--bus", "socketcan:can9"], "there is no such interface"),
         ('[task]\nkind = "hover"', NEAR, [], "modules 1 and 2 start 0.1 m apart, one inside the other"),
         ('kind = "hover"', 'kind = "waypoints"\nfile = "points.csv"', [], "points.csv:3: y_m: 'north' is not a number"),
     ],
-    ids=["vehicle", "mesh", "rate", "bus", "overlap", "waypoints"],
+    ids=["vehicle", "large", "mesh", "rate", "bus", "overlap", "waypoints"],
 )
 def test_refused_flight_leaves_the_one_before_as_it_was(
     realtime: list[str], old: str, new: str, options: list[str], why: str,
