@@ -151,7 +151,8 @@ def _read_csv(text: str, path: str) -> Mission:
     try:
         return Mission(waypoint=rows)
     except DescriptionError as error:
-        raise DescriptionError(f"{path}: {error}") from None
+        line = f":{line_of(text, path, int(error.keys[1]))}" if error.keys else ""
+        raise DescriptionError(f"{path}{line}: {error}") from None
 
 
 def _header(header: list[str], path: str) -> list[str]:

@@ -320,7 +320,7 @@ def test_scenario_flies_the_same_path_where_its_file_is_not(tmp_path: Path) -> N
         ("path.csv", ",20", ",0.9", "path.csv:4: the thrusters would be used to more than 1000 % of their range, of at most 80 %, "),
         ("path.csv", ",20", ",2.5", "; allow more time"),
         ("path.csv", "0.1,-0.2", "0.1,north", "path.csv:3: y_m: 'north' is not a number"),
-        ("path.csv", ",20", ",", "path.csv: waypoint 1 lacks duration_s"),
+        ("path.csv", ",20", ",", "path.csv:3: waypoint 1 lacks duration_s"),
         ("path.csv", "0.5,,,,,20", "0.5,,,,,20,3", "path.csv:3: has more columns than the header"),
         ("path.toml", "[limits]\nvelocity_m_s = [0.05, 0.05, 0.05]", "", "path.toml: has no durations; add duration_s, or [limits] with v"),
         ("path.toml", "velocity_m_s = [0.05, 0.05, 0.05]", "angular_rate_rad_s = 1.0", "limit that this path meets, on velocity or "),
