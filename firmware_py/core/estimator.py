@@ -22,6 +22,7 @@ import numpy as np
 from firmware_py.core import observation
 from firmware_py.core.alignment import TagAgreement, upright
 from firmware_py.core.body import CRUISE_M_S, Body
+from firmware_py.core.depth_gate import MOST_STEP_M
 from firmware_py.core.history import WINDOW_NS, History
 from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.rigid_body import restoring_moment
@@ -196,7 +197,7 @@ class Estimator:
         x[3:7] = pose.q_wb
         x[:3] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
         x[29:] = down_of(x)
-        self._history.forget_depths(float(x[2]), 5.0 * INITIAL_SIGMA[-1])
+        self._history.forget_depths(float(x[2]), MOST_STEP_M)
         inertia = np.diag(self._body.mass)
         sigma = np.r_[np.repeat(np.array(INITIAL_SIGMA), [3, 3, 3, 3, 3, 3, 3, 3, 1]), self._body.righting_sigma]
         sigma[18:24] *= inertia

@@ -47,7 +47,7 @@ class History:
         self._rows[both, 3] = np.nan if depth_m is None else depth_m
 
     def forget_depths(self, depth_m: float, most_m: float) -> None:
-        """Drops the kept depth readings that are more than `most_m` from a depth: no estimate judged them when they came."""
+        """Drops the kept depth readings that differ from a depth by more than `most_m`, both m: no estimate judged them when they came."""
         self._rows[np.abs(self._rows[:, 3] - depth_m) > most_m, 3] = np.nan
 
     def time_of(self, index: int) -> int:

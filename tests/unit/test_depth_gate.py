@@ -217,15 +217,20 @@ def with_pressure(change: Callable[[float, int], float], mode: Mode, seconds: fl
     return tank, farthest
 
 
-def lose_tags(tank: Tank) -> None:
+def tamper_with(tank: Tank, change: Callable[[ModuleInputs, int], None]) -> None:
+    """Lets `change` alter what the single module hears, tick by tick, from now on."""
     hear = tank._hear
 
-    def blind(tick: int) -> list[ModuleInputs]:
+    def heard(tick: int) -> list[ModuleInputs]:
         (module,) = hear(tick)
-        module.tags = []
+        change(module, tick)
         return [module]
 
-    tank._hear = blind  # type: ignore[method-assign]
+    tank._hear = heard  # type: ignore[method-assign]
+
+
+def lose_tags(module: ModuleInputs, _: int) -> None:
+    module.tags = []
 
 
 WRONG: dict[str, Callable[[float, int], float]] = {
@@ -260,7 +265,7 @@ def test_robot_keeps_its_depth_when_the_weather_changes_at_once(offset_pa: float
 
 def test_robot_that_loses_the_tags_with_a_false_pressure_comes_up_as_one_that_knows_no_depth() -> None:
     tank, _ = with_pressure(WRONG["5 m too deep"], Mode.ALT_HOLD, 2.0)
-    lose_tags(tank)
+    tamper_with(tank, lose_tags)
     assert tank.run(7.0).records[0].mode == Mode.SURFACE
 
 
@@ -269,17 +274,14 @@ def test_robot_that_loses_the_tags_with_a_false_pressure_comes_up_as_one_that_kn
 def test_first_tags_give_a_pose_whatever_the_pressure_sensor_tells(offset_m: float, blind_s: float) -> None:
     """A broken one, or a lake at 3800 m: readings from before the first tags pulled the filter off, and it refused the tags for ever."""
     tank = Tank([single()])
-    hear = tank._hear
 
-    def false(tick: int) -> list[ModuleInputs]:
-        (module,) = hear(tick)
+    def change(module: ModuleInputs, tick: int) -> None:
         if module.pressure_pa is not None:
             module.pressure_pa += offset_m * PA_PER_M
         if tick * DT < blind_s:
-            module.tags = []
-        return [module]
+            lose_tags(module, tick)
 
-    tank._hear = false  # type: ignore[method-assign]
+    tamper_with(tank, change)
     estimate = tank.run(blind_s + 1.0).records[0].estimate
     assert estimate.ready and estimate.rejected <= 1
     assert abs(estimate.p_wb[2] - tank.states[0][2]) < 0.01
@@ -294,5 +296,5 @@ def test_robot_in_small_waves_keeps_holding_its_depth_when_the_tags_go(height_m:
 
     tank, farthest = with_pressure(waves, Mode.ALT_HOLD, 10.0)
     assert farthest < 0.03
-    lose_tags(tank)
+    tamper_with(tank, lose_tags)
     assert tank.run(7.0).records[0].mode == Mode.ALT_HOLD
