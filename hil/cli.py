@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
-from firmware_py.description.schema import DescriptionError, did_you_mean, read_toml
+from firmware_py.description.schema import DescriptionError, Source, did_you_mean, read_toml
 from firmware_py.runtime.folders import folder_of
 from firmware_py.runtime.interrupts import ended_at_once, interrupted_once
 from firmware_py.runtime.recorder import CAN_LOG
@@ -46,27 +46,37 @@ def parameters_of(controller: str) -> Parameters:
     return CONTROLLERS[controller]
 
 
-def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
-    """The scenario `name` with the changes from the command line. Raises DescriptionError."""
-    from hil.bench import fleet_of
+def world_of(name: str, vehicle: str) -> Scenario:
+    """The scenario `name`, with other vehicles if `vehicle` is not empty. Raises DescriptionError."""
     from hil.scenario import load_scenario
     from hil.scenario_rules import mistakes
-    from hil.script import mistake_of_flight
 
     scenario = load_scenario(name)
-    file = Path(name) if name.endswith(".toml") else scenario_file(name)
-    if sensors not in ("real", "ideal"):
-        raise DescriptionError(f"sensors {sensors!r} is unknown; there are real, ideal")
-    if sensors == "ideal":
-        scenario = scenario.with_ideal_sensors()
     if vehicle:
         scenario = scenario.with_vehicle(vehicle)
         if (mistake := next(mistakes(scenario), None)) is not None:
             keys, what = mistake
-            raise read_toml(file)[1].error(keys, f"{what} (--vehicle {vehicle})")
-    if name.endswith(".toml") and (mistake := mistake_of_flight(scenario, fleet_of(scenario, DEFAULT_BUS, 100))):
-        raise read_toml(file)[1].error(*mistake)
+            raise _source_of(name).error(keys, f"{what} (--vehicle {vehicle})")
     return scenario
+
+
+def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
+    """The scenario `name` with the changes from the command line. Raises DescriptionError."""
+    from hil.bench import fleet_of
+    from hil.script import mistake_of_flight
+
+    scenario = world_of(name, vehicle)
+    if sensors not in ("real", "ideal"):
+        raise DescriptionError(f"sensors {sensors!r} is unknown; there are real, ideal")
+    if sensors == "ideal":
+        scenario = scenario.with_ideal_sensors()
+    if name.endswith(".toml") and (mistake := mistake_of_flight(scenario, fleet_of(scenario, DEFAULT_BUS, 100))):
+        raise _source_of(name).error(*mistake)
+    return scenario
+
+
+def _source_of(name: str) -> Source:
+    return read_toml(Path(name) if name.endswith(".toml") else scenario_file(name))[1]
 
 
 def check_rate(rate_hz: int) -> None:
@@ -235,14 +245,14 @@ def plant(
     seed: Annotated[int, typer.Option(min=0, help="seed of all random draws of the world")] = 0,
     rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="tick rate of the firmware, Hz")] = 100,
     out: Annotated[Path | None, typer.Option(parser=folder_of, metavar="DIR", help="folder for the log of the true motion")] = None,
+    vehicle: Vehicle = "",
 ) -> None:
     """Run the simulated plant alone, in real time, until SIGINT or SIGTERM: the other end of `modcube run`."""
     with ended_at_once():
         from hil.plant_process import serve_until_signal
-        from hil.scenario import load_scenario
 
     check_reaches_others(bus, "the plant alone")
-    serve_until_signal(load_scenario(scenario).for_seed(seed), seed, bus, rate_hz, out)
+    serve_until_signal(world_of(scenario, vehicle).for_seed(seed), seed, bus, rate_hz, out)
 
 
 @app.command("list")

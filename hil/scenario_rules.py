@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from firmware_py.description.schema import did_you_mean, is_file_name, limits_of
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle import FACE_NAMES, Vehicle, face_mismatch, load_vehicle
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
 from hil.metrics import DOCKING, SHOWN, shown
-from hil.starts import MOVE_IN, hulls_in_walls, remedy
+from hil.starts import MOVE_IN, hulls_in_walls, inscribed_radius_m, remedy, sphere_in_wall
 
 if TYPE_CHECKING:
     from hil.scenario import Check, Scenario
@@ -131,6 +131,12 @@ def _in_tank(scenario: Scenario) -> Iterator[Mistake]:
         if not scenario.tank.holds(place):
             where = f"{place.tolist()} m is outside the tank, a {scenario.tank}"
             yield (table, i, "position_m"), f"{where} with its surface's centre at [0, 0, 0]"
+    vehicles = _vehicles(scenario)
+    for i, step in enumerate(scenario.step):
+        if step.do == "move" and step.module in vehicles:
+            where = sphere_in_wall(scenario.tank, step.position_m, inscribed_radius_m(vehicles[step.module]))
+            if where:
+                yield ("step", i, "position_m"), f"there the hull of module {step.module} is {where}, however it is turned; {MOVE_IN}"
     for i, where in hulls_in_walls(scenario, np.zeros((1, 3)), np.zeros(1)):
         leader = next(members[0] for members in scenario.groups if i in members)
         module = scenario.module[i]
@@ -167,6 +173,17 @@ def _in_mentions(scenario: Scenario) -> Iterator[Mistake]:
             yield keys, f"no module has the number {number}; {every} {', '.join(map(str, numbers))}"
 
 
+def _in_faces(scenario: Scenario) -> Iterator[Mistake]:
+    """Checks that the faces of each dock are a probe and a drogue."""
+    vehicles = _vehicles(scenario)
+    for i, step in enumerate(scenario.step):
+        if step.do != "dock" or not {step.module, step.target_module} <= vehicles.keys():
+            continue
+        faces = FACE_NAMES.index(step.face), FACE_NAMES.index(step.target_face)
+        if why := face_mismatch(vehicles[step.module], faces[0], vehicles[step.target_module], faces[1]):
+            yield ("step", i, "face"), f"module {step.module} cannot dock to module {step.target_module}: {why}"
+
+
 def _in_tags(scenario: Scenario) -> Iterator[Mistake]:
     """Checks that each tagged vehicle has a tag that cameras read, i.e. one of `tags`. Skipped without cameras or tags."""
     if not scenario.camera or not scenario.tags:
@@ -178,15 +195,15 @@ def _in_tags(scenario: Scenario) -> Iterator[Mistake]:
             yield ("module", i, "vehicle"), f"{module.vehicle} has no tag of tags = {list(scenario.tags)}; it has {has}"
 
 
-def _thrusters(scenario: Scenario) -> dict[int, int]:
-    """Number of thrusters of each module, by module number. Raises DescriptionError when a vehicle cannot be loaded."""
-    counts = {vehicle: len(load_vehicle(vehicle).thruster) for vehicle in {module.vehicle for module in scenario.module}}
-    vehicles = itertools.cycle(module.vehicle for module in scenario.module)  # a polycube's modules are all of one kind
-    return {number: counts[vehicle] for number, vehicle in zip(module_numbers(scenario), vehicles, strict=False)}
+def _vehicles(scenario: Scenario) -> dict[int, Vehicle]:
+    """Vehicle of each module, by module number. Raises DescriptionError when a vehicle cannot be loaded."""
+    loaded = {name: load_vehicle(name) for name in {module.vehicle for module in scenario.module}}
+    vehicles = itertools.cycle(loaded[module.vehicle] for module in scenario.module)  # a polycube's modules are all of one kind
+    return dict(zip(module_numbers(scenario), vehicles, strict=False))
 
 
 def _in_faults(scenario: Scenario) -> Iterator[Mistake]:
-    thrusters = _thrusters(scenario)
+    thrusters = {number: len(vehicle.thruster) for number, vehicle in _vehicles(scenario).items()}
     for i, fault in enumerate(scenario.fault):
         for key, what in fault.mistakes(thrusters):
             yield ("fault", i, key), what
@@ -223,6 +240,6 @@ def _out_of_reach(check: Check) -> Iterator[tuple[str, str]]:
 
 RULES = (
     _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_tank, _in_start, _in_mentions,
-    _in_tags, _in_faults, _in_checks,
+    _in_faces, _in_tags, _in_faults, _in_checks,
 )  # fmt: skip
 """In order of priority: the first mistake found is the one reported."""

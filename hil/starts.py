@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
@@ -71,6 +72,18 @@ def in_wall(tank: Tank, points: np.ndarray) -> str:
     return f"{deepest[wall]:.3g} m into the {wall} of the tank, a {tank}" if deepest[wall] > TOUCHING_M else ""
 
 
+def inscribed_radius_m(vehicle: Vehicle) -> float:
+    """Radius of the largest sphere about the centre of a vehicle's hull that is inside it."""
+    return 0.5 * float(vehicle.hull.size_m.min())
+
+
+def sphere_in_wall(tank: Tank, centre_m: np.ndarray, radius_m: float) -> str:
+    """Describes which wall a sphere penetrates deepest, as `in_wall` does."""
+    x, y, _ = centre_m.tolist()
+    outward = np.array([x, y, 0.0]) / max(math.hypot(x, y), TOUCHING_M)
+    return in_wall(tank, centre_m + radius_m * np.array([*np.eye(3), *-np.eye(3), outward]))
+
+
 def remedy(tank: Tank, vehicle: Vehicle, start: Start) -> str:
     """What to do about a hull that starts in a wall: move it, or, if it is larger than the tank in its attitude, take another."""
     extent = np.ptp(hull_of(vehicle, start), axis=0)
@@ -117,7 +130,7 @@ def refuse_in_walls(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Seq
 
 def refuse_overlap(scenario: Scenario, vehicles: Sequence[Vehicle], starts: Sequence[Start], seed: int) -> None:
     """Raises DescriptionError when two bodies would start inside each other: the inscribed spheres of their hulls overlap."""
-    radii = [0.5 * float(vehicle.hull.size_m.min()) for vehicle in vehicles]
+    radii = [inscribed_radius_m(vehicle) for vehicle in vehicles]
     docked = {pair for members in scenario.groups for pair in itertools.combinations(members, 2)}
     for (i, one), (j, other) in itertools.combinations(enumerate(starts), 2):
         apart_m = float(np.linalg.norm(one.p_wm - other.p_wm))

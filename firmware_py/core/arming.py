@@ -91,6 +91,10 @@ def _escs(q: Question) -> list[str]:
     return [f"ESC {escs} does not answer" for escs in listed(q.health.esc_missing)]
 
 
+def _unknown_escs(q: Question) -> list[str]:
+    return [f"ESC {escs} answers, but the vehicle file has no thruster there" for escs in listed(q.health.esc_unknown)]
+
+
 def _thrusters(q: Question) -> list[str]:
     reasons = [f"{axis} has no thrust: declare it in passive_dof of the vehicle file, or add thrusters" for axis in q.health.without_thrust]
     return reasons + (["the thrusters left cannot make every wrench"] if q.health.lost_axes else [])
@@ -136,6 +140,7 @@ CHECKS = (
     Check("battery and cabin known", _readings, True),
     Check("modules fit", _fit, True),
     Check("every ESC answers", _escs, True),
+    Check("no ESC without a thruster", _unknown_escs, True),
     Check("every axis has thrust", _thrusters, True),
     Check("no fail-safe on", _failsafes, True),
     Check("few bad frames", _frames, True),

@@ -87,6 +87,8 @@ class Health(NamedTuple):
     """Modules of each joint that is open although it should hold."""
     push_m_s: float = 0.0
     """Speed of the current that would explain the estimated horizontal disturbance force; RMS over a second."""
+    esc_unknown: tuple[Place, ...] = ()
+    """Places without a thruster by the vehicle file from which an ESC answers."""
     without_thrust: tuple[str, ...] = ()
     """Axes that no thruster of the body can push although the vehicle does not declare them passive."""
 

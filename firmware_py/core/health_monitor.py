@@ -12,7 +12,7 @@ from firmware_py.core.faults import ESC_DOWN, ThrusterFaults, by_channel
 from firmware_py.core.fence import outside
 from firmware_py.core.health import Health
 from firmware_py.core.rotations import rotate
-from firmware_py.core.thruster_names import places_of
+from firmware_py.core.thruster_names import Place, places_of
 from firmware_py.core.types import MCU_ESTOP, MCU_UNFIT, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import AXES
@@ -64,6 +64,8 @@ class HealthMonitor:
         self._without_thrust = tuple(AXES[axis] for axis in axes_without_thrust(body.thrusters.matrix, body.passive))
         self._places = places_of(body)
         self._esc_ns = [NEVER_NS] * len(self._places)
+        self._unknown_esc_ns: dict[Place, int] = {}
+        """When an ESC was last heard that belongs to no thruster, by its place."""
         never = dict.fromkeys(body.modules, NEVER_NS)
         self._heard_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns = (never.copy() for _ in range(5))
         self._unfit, self._leak, self._wet = (dict.fromkeys(body.modules, False) for _ in range(3))
@@ -100,6 +102,7 @@ class HealthMonitor:
         """Inherits from the bodies that this one is made of, or was part of: the last reports of each module, and `_Latest`."""
         for other in before:
             self._stopped_ns |= other._stopped_ns
+            self._unknown_esc_ns |= {at: ns for at, ns in other._unknown_esc_ns.items() if at.module in self._thruster_at}
             for mine, theirs in zip(self._per_module, other._per_module, strict=True):
                 mine |= {module: told for module, told in theirs.items() if module in self._thruster_at}
             for module, thrusters in self._thruster_at.items():
@@ -171,6 +174,7 @@ class HealthMonitor:
             battery_age_s=(now - min(self._battery_ns.values())) * 1e-9,
             cabin_age_s=(now - min(self._cabin_ns.values())) * 1e-9,
             push_m_s=math.sqrt(latest.push_m2_s2),
+            esc_unknown=tuple([at for at, ns in self._unknown_esc_ns.items() if now - ns <= self._esc_fresh_ns]),
             without_thrust=self._without_thrust,
         )
 
@@ -202,7 +206,7 @@ class HealthMonitor:
                 start = self._cabin_start_pa.setdefault(index, module.cabin_pressure_pa)
                 self._cabin_change_pa[index] = abs(module.cabin_pressure_pa - start)
             if module.esc:
-                self._hear_escs(self._thruster_at[index], module.esc, now)
+                self._hear_escs(index, module.esc, now)
 
     def _hear_stops(self, modules: Sequence[ModuleInputs], now: int) -> None:
         """Notes e-stop reports of the whole fleet: an ESTOP on one bus stops bodies on the others too, even if only a module heard it."""
@@ -218,11 +222,16 @@ class HealthMonitor:
         gap_ns = last_ns - before_ns
         return gap_ns * 1e-9 if before_ns != NEVER_NS and now - last_ns <= 2 * gap_ns else math.nan
 
-    def _hear_escs(self, thruster_at: dict[int, int], escs: list[EscFeedback], now: int) -> None:
+    def _hear_escs(self, module: int, escs: list[EscFeedback], now: int) -> None:
+        thruster_at = self._thruster_at[module]
         for esc in escs:
             for channel, status in enumerate(esc.status, esc.first):
-                if status not in ESC_DOWN and channel in thruster_at:
+                if status in ESC_DOWN:
+                    continue
+                if channel in thruster_at:
                     self._esc_ns[thruster_at[channel]] = now
+                else:
+                    self._unknown_esc_ns[Place(module, channel)] = now
 
     def _hear_operators(self, requests: list[Request], now: int) -> None:
         for request in requests:

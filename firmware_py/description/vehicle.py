@@ -31,6 +31,7 @@ from firmware_py.description.schema import (
 _Module = TypeVar("_Module", bound=Any)
 
 FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
+FACE_KINDS = {"P": "a probe", "D": "a drogue", "-": "no docking face"}
 """Faces A..F of the bus, in order; the index is also the id of a tag on that face."""
 
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
@@ -239,6 +240,14 @@ class Vehicle:
     def cd_corner(self) -> float:
         """Drag coefficient along a space diagonal, from the face and edge values (quartic cubic harmonic)."""
         return (4.0 * self.drag.cd_edge - self.drag.cd_face) / 3.0
+
+
+def face_mismatch(of: Vehicle, face: int, to: Vehicle, target_face: int) -> str:
+    """Why a face of one vehicle cannot dock to a face of another, in words; empty where it can."""
+    kinds = of.faces[face], to.faces[target_face]
+    if set(kinds) == {"P", "D"}:
+        return ""
+    return f"{FACE_NAMES[face]} is {FACE_KINDS[kinds[0]]} and {FACE_NAMES[target_face]} {FACE_KINDS[kinds[1]]}; a probe docks to a drogue"
 
 
 def vehicle_names() -> list[str]:

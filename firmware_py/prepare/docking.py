@@ -12,7 +12,7 @@ from firmware_py.core.docking_sequence import DockPlan, UndockPlan
 from firmware_py.core.joints import joints_of, modules_of, turned
 from firmware_py.core.types import DockRequest
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS, Vehicle
+from firmware_py.description.vehicle import FACE_NORMALS, Vehicle, face_mismatch
 from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.joints import connected_to
 from firmware_py.prepare.lattice import MATRICES, QUATERNIONS, nearest
@@ -28,8 +28,12 @@ def plan_dock(request: DockRequest, active: Body, target: Body, vehicles: Sequen
         vehicles: by fleet index.
 
     Raises:
-        DescriptionError: the two would overlap, a probe would meet no drogue, or both faces are drogues; names the modules.
+        DescriptionError: the two faces are not a probe and a drogue, the bodies would overlap, or elsewhere a probe would meet no drogue;
+            names the modules.
     """
+    active_vehicle, target_vehicle = vehicles[request.module], vehicles[request.target_module]
+    if why := face_mismatch(active_vehicle, request.face, target_vehicle, request.target_face):
+        raise DescriptionError(f"module {request.module} cannot dock to module {request.target_module}: {why}")
     turn_t = _turn_of(target, request.target_module)
     normal = _rounded(turn_t @ FACE_NORMALS[request.target_face])
     new_turn = _mated(turn_t, request, normal)
@@ -46,9 +50,6 @@ def plan_dock(request: DockRequest, active: Body, target: Body, vehicles: Sequen
         pitch_m,
     )
     closes = [joint.request for joint in joints_of(merged) if len(modules_of(joint.request).intersection(active.modules)) == 1]
-    if modules_of(request) not in map(modules_of, closes):
-        names = FACE_NAMES[request.face], FACE_NAMES[request.target_face]
-        raise DescriptionError(f"face {names[0]} of module {request.module} does not dock to {names[1]} of {request.target_module}")
     return DockPlan(
         request=request,
         closes=tuple(closes),
@@ -134,8 +135,6 @@ def _met(whole: Body, inside: np.ndarray, way: np.ndarray) -> set[int]:
 def _mated(turn_t: np.ndarray, request: DockRequest, normal: np.ndarray) -> np.ndarray:
     """(3, 3) rotation of the active module in the target's lattice, its face against the target's."""
     fits = [m for m in MATRICES if np.array_equal(_rounded(m @ FACE_NORMALS[request.face]), -normal)]
-    if not fits:
-        raise DescriptionError(f"face {request.face} is none of {', '.join(FACE_NAMES)}")
     least = max(fits, key=lambda m: float(np.trace(turn_t.T @ m)))
     quarter = rotations.to_matrix(rotations.exp(normal * (0.5 * np.pi * request.quarter_turns)))
     return np.asarray(MATRICES[nearest(quarter @ least)])

@@ -116,8 +116,9 @@ class Tank:
         t = self.bodies[n].thrusters
         speed = np.sign(self.forces[n]) * t.rpm_at_full * np.sqrt(np.abs(self.forces[n]) / np.where(self.forces[n] > 0, 10.0, 8.0))
         rpm = [float(v) for v in speed[t.module == k]]
+        status = [0] * len(rpm) + [3] * (CHANNELS - len(rpm))  # SILENT: not there
         rpm += [0.0] * (CHANNELS - len(rpm))
-        return [EscFeedback(i, (rpm[i], rpm[i + 1]), (1.0, 1.0), (0, 0)) for i in range(0, CHANNELS, 2)]
+        return [EscFeedback(i, (rpm[i], rpm[i + 1]), (1.0, 1.0), (status[i], status[i + 1])) for i in range(0, CHANNELS, 2)]
 
     def _tag(self, n: int, k: int, tick: int) -> TagObservation:
         body, x = self.bodies[n], self.past[tick][n]

@@ -60,6 +60,7 @@ SOFT: list[tuple[Health, str]] = [
     (GOOD._replace(nis_ratio=6.0), "sensors and model disagree: 6.0 of the expected, 5.0 permitted"),
     (GOOD._replace(unfit=(0, 2)), "module 0, 2 starts, or has a fault"),
     (GOOD._replace(esc_missing=(Place(0, 0), Place(0, 7))), "ESC 1, 8 of module 0 does not answer"),
+    (GOOD._replace(esc_unknown=(Place(2, 6), Place(2, 7))), "ESC 7, 8 of module 2 answers, but the vehicle file has no thruster there"),
     (GOOD._replace(lost_axes=1), "the thrusters left cannot make every wrench"),
     (GOOD._replace(without_thrust=("pitch",)), "pitch has no thrust: declare it in passive_dof of the vehicle file, or add thrusters"),
     (GOOD._replace(frame_errors_per_s=21.0), "21 bad frames a second, 20 permitted"),
@@ -116,7 +117,7 @@ def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
     ]  # fmt: skip
     assert [check.name for check in CHECKS if check.may_be_skipped] == [
         "pose fresh", "pose sure", "pose consistent", "battery and cabin known",
-        "modules fit", "every ESC answers", "every axis has thrust", "no fail-safe on",
+        "modules fit", "every ESC answers", "no ESC without a thruster", "every axis has thrust", "no fail-safe on",
         "few bad frames", "topology as configured",
     ]  # fmt: skip
     both = GOOD._replace(silent=(2,), tag_age_s=0.7)

@@ -23,9 +23,11 @@ from firmware_py.prepare.assembly import assemble
 
 TICK_NS = 10_000_000
 START_NS = 3600 * 10**9
-BODY = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2, [1, 3])
+MODCUBE = load_vehicle("modcube")
+SIX = dataclasses.replace(MODCUBE, thruster=MODCUBE.thruster[:6])
+BODY = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [MODCUBE] * 2, [1, 3])
 EVERY = tuple(Place(module, channel) for module in (1, 3) for channel in range(8))
-SINGLE = assemble([(0, 0, 0)], [0], [load_vehicle("modcube")], [1])
+SINGLE = assemble([(0, 0, 0)], [0], [MODCUBE], [1])
 ZERO = np.zeros(3)
 
 
@@ -252,6 +254,19 @@ def test_esc_that_fails_or_falls_silent_is_missing() -> None:
     assert bench.step(here(esc=good), here(esc=bad)).esc_missing == (Place(3, 6), Place(3, 7))
     assert bench.wait(1.0).esc_missing == (Place(3, 6), Place(3, 7))
     assert bench.step().esc_missing == EVERY
+
+
+def test_esc_that_answers_where_the_vehicle_file_has_no_thruster_is_unknown() -> None:
+    """A vehicle of six thrusters by its file, whose MCU reports eight ESCs."""
+    bench = MonitorBench(assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [SIX, MODCUBE], [1, 3]))
+    last = [EscFeedback(6, (0.0, 0.0), (0.0, 0.0), (3, 0))]
+    assert bench.step(here(esc=last), here(esc=last)).esc_unknown == (Place(1, 7),), "a silent ESC is none"
+    alone, other = (MonitorBench(assemble([(0, 0, 0)], [0], [vehicle], [module])) for vehicle, module in ((SIX, 1), (MODCUBE, 3)))
+    for part in (alone, other):
+        part.monitor.take_over([bench.monitor])
+        part.time_ns = bench.time_ns
+    assert alone.step().esc_unknown == (Place(1, 7),) and other.step().esc_unknown == ()
+    assert bench.wait(0.9).esc_unknown == (Place(1, 7),) and bench.wait(0.2).esc_unknown == ()
 
 
 def test_ground_station_and_pilot_count_once_they_were_heard() -> None:

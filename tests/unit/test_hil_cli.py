@@ -150,6 +150,20 @@ def test_plant_alone_serves_the_modules_of_its_seed(monkeypatch: pytest.MonkeyPa
     assert min(served) > 1
 
 
+def test_plant_alone_takes_another_vehicle_and_holds_it_against_the_scenario(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    served: list[str] = []
+    monkeypatch.setattr(hil.plant_process, "serve_until_signal", lambda scenario, *_: served.append(scenario.module[0].vehicle))
+    bus = ["--bus", "udp:239.74.163.9:43119", "--vehicle"]
+    assert status_of(["plant", "hover", *bus, "bluerov2"], monkeypatch) == 0 and served == ["bluerov2"]
+    assert status_of(["plant", "hover", *bus, "bluerov9"], monkeypatch) == 2
+    assert status_of(["plant", "dock", *bus, "bluerov2"], monkeypatch) == 2
+    unknown, too_large = capsys.readouterr().err.splitlines()
+    assert "vehicle 'bluerov9' is unknown" in unknown
+    assert "into the wall" in too_large and too_large.endswith("(--vehicle bluerov2)") and served == ["bluerov2"]
+
+
 def test_rate_that_the_plant_cannot_follow_is_refused_with_those_that_it_can(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

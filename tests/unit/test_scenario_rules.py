@@ -56,7 +56,15 @@ def load(tmp_path: Path) -> Load:
         ("dock", DOCK_STEP, "", "task.kind: dock runs the [[step]]s, and there are none"),
         ("dock", "target_module = 1", "target_module = 2", "step[0]: module and target_module are both 2"),
         ("dock", "target_module = 1", "target_module = 9", "step[0].target_module: no module has the number 9; there are 1, 2"),
+        (
+            "dock", 'face = "-x"', 'face = "+y"',
+            "step[0].face: module 2 cannot dock to module 1: +y is a probe and +x a probe; a probe docks to a drogue",
+        ),
         ("dock-undock-dock", 'do = "undock"\nmodule = 2', 'do = "undock"\nmodule = 7', "step[2].module: no module has the number 7"),
+        (
+            "dock-moving", "position_m = [-0.3, 0.25, 0.38]", "position_m = [-0.6, 0.25, 0.38]",
+            "step[0].position_m: there the hull of module 1 is 0.055 m into the wall at -x of the tank",
+        ),
         ("dock-moving", 'do = "move"\nmodule = 1', 'do = "move"\nmodule = 4', "step[0].module: no module has the number 4"),
         ("force-tracking", "body = 0\ncell = [1, 0, 0]", "position_m = [2, 0, 1]", "the bodies here have 1, 1, 1 modules"),
         ("force-tracking", "body = 0\ncell = [1, 0, 0]", "body = 0\ncell = [1, 0, 0]\n[[module]]\nnumber = 4\nposition_m = [2, 0, 1]",
