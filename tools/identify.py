@@ -23,7 +23,7 @@ from pathlib import Path
 from command_line import Parser, refuse, run_tool
 
 from argument_types import check_results, folder_for_results
-from identify_excitation import MOTIONS, SPACE_M, check_space, excitation
+from identify_excitation import MOTIONS, SPACE_M, check_space, excitation, why_no_roll
 from identify_fit import Fit, Reference, fit
 from identify_log import Recording, read_recording
 from identify_model import Equations, Weight
@@ -103,9 +103,17 @@ def check_excitation(path: Path) -> None:
         raise DescriptionError(f"--excitation {path}: there already, and nothing is written over; give another name or delete it")
 
 
-def fly_it(path: Path) -> str:
-    """Line that tells how to fly the scenario in `path`, quoted for a shell."""
-    return f"fly it: .venv/bin/modcube hil run {shlex.quote(str(path))}"
+def write_excitation(path: Path, motions: Sequence[str], vehicle: Vehicle, name: str, space_m: Sequence[float]) -> None:
+    """Writes a scenario that makes the `motions`, and prints how to fly it. Raises DescriptionError and OSError.
+
+    Args:
+        name: of the vehicle, or its file.
+    """
+    no_roll = why_no_roll(vehicle) if "turning" in motions else ""
+    path.write_text(excitation(motions, name, space_m, no_roll=no_roll), encoding="utf-8")
+    if no_roll:
+        print(f"left out: roll, because {no_roll}")
+    print(f"fly it: .venv/bin/modcube hil run {shlex.quote(str(path))}")
 
 
 def print_findings(found: Sequence[Finding]) -> None:
@@ -135,9 +143,9 @@ def identify(given: argparse.Namespace) -> int:
     if not given.logs:
         if given.excitation is None:
             raise DescriptionError("no LOG was given; give the folder of a flight, or --excitation FILE for the flight to begin with")
-        check_fitted(load_vehicle(given.vehicle))
-        given.excitation.write_text(excitation(list(MOTIONS), given.vehicle, given.space), encoding="utf-8")
-        print(fly_it(given.excitation))
+        vehicle = load_vehicle(given.vehicle)
+        check_fitted(vehicle)
+        write_excitation(given.excitation, list(MOTIONS), vehicle, given.vehicle, given.space)
         return 0
     if given.hung_at and not given.weight:
         raise DescriptionError("--hung-at says where a weight hung; give --weight with it")
@@ -181,9 +189,7 @@ def write_and_report(given: argparse.Namespace, result: Fit, recording: Recordin
     for motion, needing in wanted.items():
         print(f"missing excitation: {motion}, for {', '.join(needing)}")
     if wanted:
-        chosen = given.excitation or given.out / "excite.toml"
-        chosen.write_text(excitation(list(wanted), recording.vehicle_name, given.space), encoding="utf-8")
-        print(fly_it(chosen))
+        write_excitation(given.excitation or given.out / "excite.toml", list(wanted), vehicle, recording.vehicle_name, given.space)
     return 1 if wanted else 0
 
 

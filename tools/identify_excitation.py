@@ -7,7 +7,9 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from firmware_py.core.rotations import to_matrix
 from firmware_py.description.schema import DescriptionError
+from firmware_py.description.vehicle import Vehicle
 
 SPACE_M = (0.6, 0.5, 0.3)
 """Default travel to either side of the middle: keeps the peaks below 0.45 m/s and 0.35 m/s^2."""
@@ -17,6 +19,8 @@ FREQUENCY = (1.0, 1.3, 1.7)
 """Oscillations of each axis per round, out of step so that axes, diagonals and all speeds in between occur."""
 YAW_TURNS, ROLL_TURNS = 0.81, 0.57
 """Turns per round: each peaks at half a rad/s; in slower turning the damping hides the inertia."""
+SEEN_DEG, LOOKS = 60.0, 72
+"""Incidence up to which a tag counts as seen, less than the 65 deg at which a reading ends; and roll angles that are looked at."""
 MOTIONS: Mapping[str, tuple[tuple[int, ...], bool]] = {
     "along x": ((0,), False),
     "along y": ((1,), False),
@@ -28,7 +32,7 @@ MOTIONS: Mapping[str, tuple[tuple[int, ...], bool]] = {
 """Axes along which each motion oscillates, and whether it turns."""
 
 TEMPLATE = """\
-# Written by tools/identify.py: {why}.
+# Written by tools/identify.py: {why}{left_out}.
 name = "excite"
 help = "for tools/identify.py: {why}"
 tags = [0, 1, 2, 3, 4, 5]
@@ -78,11 +82,25 @@ def _words(space_m: Sequence[float]) -> str:
     return " ".join(f"{free:g}" for free in space_m)
 
 
-def excitation(motions: Collection[str], vehicle: str, space_m: Sequence[float] = SPACE_M, duration_s: float = 170.0) -> str:
+def why_no_roll(vehicle: Vehicle) -> str:
+    """Why a vehicle cannot roll full turns below the camera, in words; empty where it can."""
+    if "roll" in vehicle.passive_dof:
+        return "its roll is left to buoyancy"
+    outward = np.array([-to_matrix(tag.quaternion.copy())[:, 2] for tag in vehicle.tag])
+    angle = np.linspace(0.0, 2.0 * np.pi, LOOKS, endpoint=False)
+    up = np.stack([np.zeros(LOOKS), np.sin(angle), -np.cos(angle)])
+    seen = (outward @ up >= math.cos(math.radians(SEEN_DEG))).any(axis=0)
+    return "" if seen.all() else "the camera would lose its tags, which do not face all ways"
+
+
+def excitation(
+    motions: Collection[str], vehicle: str, space_m: Sequence[float] = SPACE_M, duration_s: float = 170.0, no_roll: str = ""
+) -> str:
     """TOML text of a scenario that makes the `motions` (keys of MOTIONS). Raises DescriptionError where one has no room.
 
     Args:
         vehicle: name or file. space_m: (3,) how far the vehicle may go to either side of the middle, along each world axis.
+        no_roll: why the vehicle turns about the vertical alone, if so.
     """
     check_space(space_m)
     axes = {axis for motion in motions for axis in MOTIONS[motion][0]}
@@ -100,5 +118,6 @@ def excitation(motions: Collection[str], vehicle: str, space_m: Sequence[float] 
         frequency=list(FREQUENCY),
         turns=rounds,
         yaw=YAW_TURNS if turns else 0.0,
-        roll=ROLL_TURNS if turns else 0.0,
+        roll=ROLL_TURNS if turns and not no_roll else 0.0,
+        left_out=f" without roll: {no_roll}" if no_roll else "",
     )

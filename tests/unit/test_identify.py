@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -95,6 +96,27 @@ def test_excitation_makes_only_the_motion_that_is_missing(motions: list[str], ax
     task = load_scenario(str(file)).task
     assert np.flatnonzero(task.amplitude_m).tolist() == axes
     assert (task.yaw_turns != 0.0) is turns and (task.roll_turns != 0.0) is turns
+
+
+@pytest.mark.parametrize(
+    ("faces", "passive", "why"),
+    [
+        (range(6), (), ""), ((2, 3, 4, 5), (), ""), ((0, 1, 5), (), "lose its tags"), ((3, 4, 5), (), "lose its tags"),
+        (range(6), ("roll",), "left to buoyancy"),
+    ],
+)  # fmt: skip
+def test_vehicle_rolls_only_where_the_camera_keeps_a_tag_in_sight(
+    faces: Sequence[int], passive: tuple[str, ...], why: str, tmp_path: Path
+) -> None:
+    """Face A is +x, F is -z, the top one."""
+    whole = load_vehicle("modcube")
+    tags = tuple(tag for tag in whole.tag if tag.id in faces)
+    no_roll = excitation.why_no_roll(dataclasses.replace(whole, tag=tags, passive_dof=passive))
+    assert bool(no_roll) == bool(why) and why in no_roll
+    file = tmp_path / "shake.toml"
+    file.write_text(excitation.excitation(["turning"], "modcube", no_roll=no_roll))
+    task = load_scenario(str(file)).task
+    assert task.yaw_turns and bool(task.roll_turns) is not bool(why)
 
 
 def test_smaller_room_is_kept_and_shaken_faster() -> None:
