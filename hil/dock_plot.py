@@ -25,6 +25,8 @@ TRUE_GAP = "true gap (near by, until locked)"
 """Label of the plant's own gap, which does not exist for modules far from each other or of the same body."""
 PAUSE_NS = 1_000_000_000
 """Pause between two rows of a pair above which the second belongs to another dock."""
+LEGEND_SHARE = 0.2
+"""Height added above the curves for the legend, as a share of theirs."""
 LAST_SHARE = 0.08
 """Share of the time axis added after a dock's last tick, in which its last stage begins."""
 LEAST_SHARE = 0.04
@@ -80,7 +82,7 @@ def _currents(axes: Any, time_s: np.ndarray, current_ma: np.ndarray) -> None:
     for sign, label in ((1.0, f"threshold, {THRESHOLD_MA:g} mA"), (-1.0, None)):
         axes.axhline(sign * THRESHOLD_MA, color=MARK, linestyle="--", linewidth=0.9, label=label)
     axes.set(ylabel="mA", title="Relay currents of the two faces")
-    axes.legend(loc="upper left", ncols=3, fontsize=9)
+    _legend_above(axes)
 
 
 def _gap(axes: Any, time_s: np.ndarray, rows: Columns, truth: Columns, start_ns: int) -> None:
@@ -90,6 +92,13 @@ def _gap(axes: Any, time_s: np.ndarray, rows: Columns, truth: Columns, start_ns:
     under_way = (true_s >= time_s[0]) & (true_s <= time_s[-1])
     axes.plot(true_s[under_way], 1e3 * truth["gap_m"][under_way], color="black", linestyle=":", linewidth=1.2, label=TRUE_GAP)
     axes.set(ylabel="mm", title="Gap between the two faces, and lateral offset")
+    _legend_above(axes)
+
+
+def _legend_above(axes: Any) -> None:
+    """Legend at the top, with room for it above the curves."""
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + LEGEND_SHARE * (high - low))
     axes.legend(loc="upper right", ncols=3, fontsize=9)
 
 
