@@ -140,7 +140,8 @@ class Task:
     yaw_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of yaw per turn of u")
     roll_turns: float = quantity(0.0, low=-100, high=100, help="lissajous: whole turns of roll per turn of u")
     file: str = quantity("", help="waypoints: CSV or TOML file (prepare/waypoints.py), beside the scenario's file; once read: its path")
-    file_text: str = quantity("", help="text of `file`, read with the scenario, which can then be flown without the file")
+    file_text: str = ""
+    """Text of `file`, read with the scenario, which can then be flown without the file."""
     centre_m: np.ndarray = quantity(
         [0, 0, 0],
         unit="m",
@@ -311,8 +312,6 @@ def load_scenario(name: str) -> Scenario:
 
 def _with_file_text(scenario: Scenario, folder: Path, source: Source) -> Scenario:
     """Returns the scenario with the text of the task's file read in. Raises DescriptionError."""
-    if scenario.task.file_text:
-        raise source.error(("task", "file_text"), "is read from `file`; give that alone")
     if not scenario.task.file:
         return scenario
     path = folder / scenario.task.file

@@ -203,11 +203,13 @@ def repeated(items: Sequence[object]) -> Iterator[int]:
 def build(cls: type, table: Mapping[str, Any], source: Source, keys: tuple[str | int, ...] = ()) -> Any:
     """Builds an instance of dataclass `cls` from `table`; refuses unknown, missing, ill-typed and out-of-range keys.
 
+    Only fields made by `quantity` are keys.
+
     Raises:
         DescriptionError: one line with file, line, key and what would be right.
     """
     hints = typing.get_type_hints(cls)
-    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}
+    fields = {f.name: f for f in dataclasses.fields(cls) if f.init and "limits" in f.metadata}
     for key in table:
         if key not in fields:
             known = ", ".join(sorted(fields))

@@ -145,7 +145,7 @@ def load(tmp_path: Path) -> Load:
         ("waypoints", 'file = "waypoints.csv"', "", "task.kind: waypoints flies a file, and there is none"),
         ("waypoints", 'file = "', 'file = "no-', "no-waypoints.csv: cannot be read: No such file or directory"),
         ("waypoints", 'file = "waypoints.csv"', 'file = "."', "cannot be read: Is a directory"),
-        ("waypoints", 'file = "', 'file_text = "x_m"\nfile = "', "task.file_text: is read from `file`"),
+        ("waypoints", 'file = "', 'file_text = "x_m"\nfile = "', "task.file_text: unknown key; did you mean file? permitted here: "),
         ("hover", 'name = "hover"', 'name = "../hover"', "name: '../hover' cannot be the name of a folder"),
         ("hover", 'name = "hover"', 'name = ""', "name: '' cannot be the name of a folder"),
         ("hover", 'name = "hover"', 'name = ".."', "name: '..' cannot be the name of a folder"),
