@@ -53,12 +53,12 @@ def _prepare_part(request: PartRequest, bodies: Bodies, pipeline: Pipeline, vehi
         except DescriptionError as error:
             refusal = str(error)
             continue
-        return _parting(plan, pipeline)
+        return _parting(plan.opens[0], plan, pipeline)
     return Prepared(request.joints[0], None, (), refusal)
 
 
-def _parting(plan: UndockPlan, pipeline: Pipeline) -> Prepared:
-    return Prepared(plan.opens[0], plan, (pipeline.body_pipeline_of(plan.stays), pipeline.body_pipeline_of(plan.leaves)))
+def _parting(request: DockRequest, plan: UndockPlan, pipeline: Pipeline) -> Prepared:
+    return Prepared(request, plan, (pipeline.body_pipeline_of(plan.stays), pipeline.body_pipeline_of(plan.leaves)))
 
 
 def _prepare_dock(request: DockRequest, bodies: Bodies, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
@@ -67,7 +67,7 @@ def _prepare_dock(request: DockRequest, bodies: Bodies, pipeline: Pipeline, vehi
         return Prepared(request, None, (), f"there is no module {request.module} or {request.target_module}")
     try:
         if active is target:
-            return _parting(plan_undock(request, active, vehicles, pitch_m), pipeline)
+            return _parting(request, plan_undock(request, active, vehicles, pitch_m), pipeline)
         plan = plan_dock(request, active, target, vehicles, pitch_m)
     except DescriptionError as error:
         return Prepared(request, None, (), str(error))

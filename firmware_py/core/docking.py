@@ -57,6 +57,8 @@ class DockingStage:
         self._expected: dict[int, DockRequest] = {}
         """By body: its newest dock or undock that waits for its plan."""
         self._joints = JointWatch(parameters)
+        self._closed: list[frozenset[int]] = []
+        """Modules of each joint that docks have closed since joints were last given to watch."""
         self.events: list[Event] = []
         self.records: list[DockRecord] = []
 
@@ -67,7 +69,8 @@ class DockingStage:
 
     def watch_joints(self, joints: Sequence[Joint]) -> None:
         """Watches `joints`, all joints of the fleet, and lets their magnets pull, except for joints that are being undocked."""
-        self._joints.watch(joints)
+        self._joints.watch(joints, self._closed)
+        self._closed = []
         parting = self._parting
         self.relays.switch(RELAY_PULL, *(joint.request for joint in joints if modules_of(joint.request) not in parting))
 
@@ -299,6 +302,8 @@ class DockingStage:
         if stage != before:
             reason = f": {dock.sequence.reason}" if dock.sequence.reason and stage > Stage.DOCKED else ""
             self._say(WARNING if stage > Stage.DOCKED else INFORMATION, f"dock {before.name} -> {stage.name}{reason}")
+            if stage in (Stage.ABORTED, Stage.FAILED) and traffic.is_coming(dock):
+                decisions.returning.append(dock.target)  # nobody watches its way any more
         if stage == Stage.DOCKED:
             self._join(dock, decisions)
         elif stage in (Stage.ABORTED, Stage.FAILED) and steering.is_apart:
@@ -330,6 +335,7 @@ class DockingStage:
         if decisions.joining.isdisjoint((dock.active, dock.target)):
             decisions.joins.append(Join(dock.target, dock.active, dock.prepared.pipelines[0]))
             self._docks.remove(dock)
+            self._closed += map(modules_of, dock.sequence.plan.closes)
 
     def _release(self, undock: Undock, time_ns: int, estimates: Estimated, decisions: Decisions) -> None:
         plan, request = undock.plan, undock.plan.opens[0]

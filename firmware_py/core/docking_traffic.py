@@ -69,10 +69,14 @@ class Traffic:
             if self._yields(courses[k], courses[:k], courses[k + 1 :]):
                 self._yielding.add(courses[k].dock.active)
 
+    def is_coming(self, dock: Dock) -> bool:
+        """Whether the target of a dock is on its way to meet the active body."""
+        return dock.sequence.meets_at_w is not None and dock.target in self._coming
+
     def blocked(self, dock: Dock) -> str:
         """Reason why a target that comes to meet the active body can come no farther; empty if it can, or does not come."""
         to_w, plan = dock.sequence.meets_at_w, dock.sequence.plan
-        if to_w is None or dock.target not in self._coming:
+        if to_w is None or not self.is_coming(dock):
             return ""
         body, at = self._estimates[dock.target]
         way = Way(body, at.p_wb, at.q_wb, to_w, at.q_wb, plan.pitch_m)

@@ -17,6 +17,9 @@ from firmware_py.description.parameters import Parameters
 if TYPE_CHECKING:
     from firmware_py.core.pipeline import BodyPipeline
 
+BROKEN_NS = 5_000_000_000
+"""How long a DISARM of a body that came apart by itself stops all its pieces: a person who sees it break means the whole."""
+
 
 class Formation:
     """The bodies of a fleet as they are docked now, each with its stages."""
@@ -25,12 +28,19 @@ class Formation:
         self.pipelines, self.docking = pipelines, docking
         self.parameters = parameters
         """The present parameters; bodies still in preparation get them when they begin."""
+        self._broken: list[tuple[int, Body]] = []
+        """Bodies that came apart by themselves in the last BROKEN_NS, and when."""
         self._watch_joints()
 
     @property
     def bodies(self) -> list[Body]:
         """The bodies, ordered by number."""
         return [pipeline.body for pipeline in self.pipelines]
+
+    def bodies_known(self, time_ns: int) -> list[Body]:
+        """The bodies, and those that came apart by themselves so recently that a person may still mean the whole."""
+        self._broken = [(at_ns, body) for at_ns, body in self._broken if time_ns - at_ns <= BROKEN_NS]
+        return [*self.bodies, *(body for _, body in self._broken)]
 
     def retune(self, parameters: Parameters) -> None:
         """Changes the parameters from this tick on."""
@@ -132,6 +142,7 @@ class Formation:
     def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:
         after = [parted.stays, parted.leaves]
         before = self._chains_of(parted.whole)
+        self._broken += [(time_ns, whole.body) for whole in before if whole.parting]
         found = [self._begin(pipeline, before, time_ns) for pipeline in after]
         parted.leaves.guidance.move_by(parted.away_w)
         self._swap(before, after, estimates, found)

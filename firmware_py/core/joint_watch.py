@@ -7,6 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from firmware_py.core.docking_detector import ModulePoses, PairBank
+from firmware_py.core.docking_pairs import CURRENT
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.types import NEVER_NS, DockRequest, ModuleInputs
 from firmware_py.description.parameters import Docking
@@ -29,10 +30,14 @@ class JointWatch:
         self._p = parameters
         self.watch(self._joints)
 
-    def watch(self, joints: Sequence[Joint]) -> None:
-        """Watches `joints` from now on; joints that were watched before keep their state."""
+    def watch(self, joints: Sequence[Joint], closed: Collection[frozenset[int]] = ()) -> None:
+        """Watches `joints` from now on; joints that were watched before keep their state. The currents of those that a dock has `closed`,
+        given by their modules, count as strong already: with the hysteresis of a joint that holds.
+        """
         self._joints = joints
         self._bank = PairBank([joint.pair for joint in joints], self._p, self._bank)
+        for row, joint in zip(self._bank.rows, joints, strict=True):
+            row["holds"][CURRENT] |= modules_of(joint.request) in closed
 
     def step(self, time_ns: int, modules: Sequence[ModuleInputs], poses: ModulePoses, resting: Collection[tuple[int, int]]) -> None:
         """Runs one tick. `resting`: modules and faces whose magnets are forced off."""

@@ -230,7 +230,7 @@ class Pipeline:
         outputs = Outputs(inputs.tick, inputs.time_ns, [IDLE] * self._modules, False, [], [])
         formation, docking = self.formation, self.formation.docking
         estimates = {pipeline.body.index: pipeline.measure(inputs) for pipeline in formation.pipelines}
-        before = formation.bodies
+        before = formation.bodies_known(inputs.time_ns)
         formation.step(inputs, estimates, outputs)
         bodies = {body.index: body for body in formation.bodies}
         requests, refusals = sift(follow(inputs.requests, before, bodies), bodies)

@@ -138,7 +138,7 @@ def follow(requests: Sequence[Request], before: Sequence[Body], bodies: Mapping[
     holds the module of that number if no body has the number any more.
 
     Args:
-        before: the bodies at the beginning of the tick. bodies: the present ones, by number.
+        before: the bodies at the beginning of the tick, and those that broke apart lately. bodies: the present ones, by number.
     """
     found: list[Request] = []
     for request in requests:
@@ -156,7 +156,7 @@ def _ends_a_task(request: Request) -> bool:
 
 
 def _holders(named: int, before: Sequence[Body], bodies: Mapping[int, Body]) -> list[int]:
-    """Numbers of the bodies that include a module of a body that has the number `named`, or had it at the beginning of the tick. A body
+    """Numbers of the bodies that include a module of a body that has the number `named`, or had it in `before`. A body
     has the number of its first module: if none has it now, the one that includes that module counts.
     """
     modules = {named, *(module for body in (*before, *bodies.values()) if body.index == named for module in body.modules)}
@@ -171,6 +171,8 @@ def against_request(request: Request, bodies: Mapping[int, Body]) -> str:
         return ""
     if request.body not in bodies:
         return f"there is no body {request.body}; there are {_listed(bodies)}"
+    if request.action == Action.MOTOR_TEST and request.argument[0] >= (count := bodies[request.body].thrusters.f_max.size):
+        return f"there is no thruster {request.argument[0]}; there are {count}, from 0 on"
     if request.action in (Action.DOCK, Action.UNDOCK):
         return _against_faces(request.action, request.argument, request.body, bodies)
     return ""

@@ -213,12 +213,14 @@ class Supervisor:
 
         Fail-safes that were on stay on. The mode is that of the body under the gravest fail-safe; if there is none, the first of the
         bodies' modes that needs no position; else POSHOLD. A body that a motor test armed counts as disarmed, and its mode is dropped.
+        MOTOR_DETECT, in which nothing holds a body, goes on in the parts of one, but not in what is joined.
         """
         flown = [other for other in before if not other._testing]  # a motor test never becomes a flight
         states = {State.DISARMED if other._testing else other.state for other in before}
         self.state = State.ESTOP if State.ESTOP in states else State.DISARMED if State.DISARMED in states else State.ARMED
         worst = max(before, key=lambda other: other.safety)
-        unplaced = [other.mode for other in flown if Need.POSITION not in MODES[other.mode].needs]
+        dropped = Mode.MOTOR_DETECT if len(before) > 1 else None
+        unplaced = [other.mode for other in flown if Need.POSITION not in MODES[other.mode].needs and other.mode != dropped]
         kept = [worst.mode] if worst.safety > Level.NONE else unplaced
         self.mode, self.level, self._chosen = next(iter(kept), Mode.POSHOLD), worst.level, worst._chosen
         self.raises_estop = any(other.raises_estop for other in before)

@@ -94,6 +94,18 @@ def test_target_that_comes_goes_back_when_the_dock_is_called_off() -> None:
 
 
 @pytest.mark.slow
+def test_target_that_comes_goes_back_when_the_dock_aborts() -> None:
+    """The active body loses its tags: its own estimate grows too unsure, and nobody watches the target's way any more."""
+    tank = tank_with_row(1.6)
+    held = tank.pipeline.formation.pipelines[0].guidance._held().p_wb.copy()
+    tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
+    tank.hidden = {1}
+    tank.run(3.0)
+    assert tank.when("ABORTED") and not tank.pipeline.formation.docking.under_way
+    np.testing.assert_allclose(tank.pipeline.formation.pipelines[0].guidance._held().p_wb, held, atol=0.02)
+
+
+@pytest.mark.slow
 def test_target_that_comes_goes_back_when_the_body_that_it_comes_to_meet_is_taken_apart() -> None:
     tank = FaultyTank([(0, 0, 0), (0, 1, 0)] * 2, each=2)
     for state, east in zip(tank.states, (0.0, 2.4), strict=True):

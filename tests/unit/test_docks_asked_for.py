@@ -213,6 +213,38 @@ def test_dock_that_is_refused_leaves_the_one_under_way_alone() -> None:
     assert [(dock.face_a, dock.face_b) for dock in outputs.docks] == [(2, 3)] and outputs.records[1].mode == Mode.DOCK
 
 
+def _pair_about_to_lock(mode: Mode) -> FaultyTank:
+    """Two single bodies, the first in `mode`; the second has just arrived at its face."""
+    tank = FaultyTank([(0, 0, 0), (0, 1, 0)], Parameters().replace("docking.push_m", 0.0).replace("steering.test_s", 0.1), apart=True)
+    for state, side in zip(tank.states, (0.0, PITCH_M), strict=True):
+        state[:7] = [1.0, side, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
+    tank.run(1.5, Request(Action.SET_MODE, 0, mode))
+    tank.run(0.03, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
+    (dock,) = tank.pipeline.formation.docking._docks
+    dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if it had just arrived
+    return tank
+
+
+@pytest.mark.slow
+def test_robot_that_docks_to_one_in_motor_detect_goes_on_holding() -> None:
+    tank = _pair_about_to_lock(Mode.MOTOR_DETECT)
+    record = tank.run(2.0).records[0]
+    assert tank.shape == [(0, 1)] and (record.state, record.mode) == (State.ARMED, Mode.POSHOLD)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("current_ma", "holds"), [(60.0, True), (50.0, False)])
+def test_joint_that_a_dock_has_closed_keeps_the_hysteresis_of_the_dock(current_ma: float, holds: bool) -> None:
+    tank = _pair_about_to_lock(Mode.POSHOLD)
+    while len(tank.shape) == 2:
+        tank.run(0.01)
+    tank.pull_ma = current_ma
+    tank.run(2.0)
+    assert any("a docked partner is lost" in words for _, words in tank.event_log) is not holds
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("armed", [0, 1])
 def test_robot_that_docks_to_one_that_is_disarmed_is_disarmed_and_says_so(armed: int) -> None:

@@ -97,3 +97,28 @@ def test_disarming_a_body_in_the_tick_in_which_it_parts_reaches_both_pieces() ->
     assert tank.shape == [(0,), (1,)]
     assert [record.state for record in outputs.records] == [State.DISARMED] * 2
     assert not np.any([module.thrusters for module in outputs.modules])
+
+
+@pytest.mark.parametrize(("after_s", "reaches"), [(0.01, 2), (4.9, 2), (5.1, 1)])
+def test_disarming_a_body_that_has_broken_apart_reaches_all_its_pieces_for_five_seconds(after_s: float, reaches: int) -> None:
+    tank = FaultyTank(RING[:2])
+    tank.fly()
+    tank.lose(1)
+    while tank.shape == [(0, 1)]:
+        tank.run(0.01)
+    tank.hidden = set()
+    tank.run(after_s - 0.01)
+    states = [record.state for record in tank.run(0.01, Request(Action.DISARM, 0)).records]
+    assert states == [State.DISARMED, State.DISARMED if reaches == 2 else State.ARMED]
+
+
+@pytest.mark.slow
+def test_disarming_a_piece_that_was_undocked_on_request_leaves_the_other_one_armed() -> None:
+    tank = FaultyTank(RING[:2])
+    tank.fly()
+    tank.run(0.01, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    while tank.shape == [(0, 1)]:
+        tank.run(0.01)
+    tank.run(0.1)
+    states = [record.state for record in tank.run(0.01, Request(Action.DISARM, 0)).records]
+    assert states == [State.DISARMED, State.ARMED]

@@ -242,11 +242,12 @@ def test_undock_that_is_asked_for_twice_parts_once(again: DockRequest) -> None:
 
 
 @pytest.mark.slow
-def test_joint_that_a_hanging_relay_holds_is_not_taken_for_undocked() -> None:
+@pytest.mark.parametrize("asked", [DockRequest(2, 1, 1, 0), DockRequest(2, 1, 1, 0, 1, True), DockRequest(2, 4, 1, 5)])
+def test_joint_that_a_hanging_relay_holds_is_not_taken_for_undocked(asked: DockRequest) -> None:
     tank = FaultyTank([(0, 0, 0), (1, 0, 0), (2, 0, 0)])
     tank.fly()
     tank.stuck = True
-    outputs = tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(2, 1, 1, 0)))
+    outputs = tank.run(3.0, Request(Action.UNDOCK, 0, asked))
     assert tank.shape == [(0, 1, 2)] and outputs.records[0].mode == Mode.POSHOLD
     assert tank.when(f"undock of module 2 ended: {IN_PLACE}")
     assert tank.pipeline.formation.docking.relays.states[2] == [0, 1, 0, 0, 0, 0], "and pulls again"

@@ -103,6 +103,11 @@ def test_argument_without_sense_is_refused(action: Action, argument: Any) -> Non
     assert against_request(Request(action, 0, argument), {0: PAIR}) == "its argument makes no sense"
 
 
+def test_test_of_a_thruster_that_is_not_there_is_refused() -> None:
+    assert against_request(Request(Action.MOTOR_TEST, 0, (15, 0.1, 1.0)), {0: PAIR}) == ""
+    assert against_request(Request(Action.MOTOR_TEST, 0, (16, 0.1, 1.0)), {0: PAIR}) == "there is no thruster 16; there are 16, from 0 on"
+
+
 @pytest.mark.parametrize(("action", "argument"), SOUND_ONES, ids=name)
 def test_argument_with_sense_passes(action: Action, argument: Any) -> None:
     assert against_request(Request(action, 0, argument), APART) == ""
