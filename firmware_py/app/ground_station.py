@@ -30,9 +30,10 @@ from firmware_py.core.types import Inputs, Outputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.files import FileWriter
 from firmware_py.ground.link import Links
 from firmware_py.ground.mission_flight import Plan, PlanJob
-from firmware_py.ground.signing import Signing, load_signing
+from firmware_py.ground.signing import FILE_MODE, Signing, load_signing
 from firmware_py.ground.station import GroundStation
 from firmware_py.ground.system import STOPPING
 from firmware_py.ground.transport import LinkError
@@ -127,6 +128,7 @@ class GroundSide:
         self._stopping = False
         self._saved_ns = 0
         self._saved_key = self.station.signing.key
+        self._writer = FileWriter()
         self._switch_s = 0.0
         self.keeper: RateKeeper | None = None
         """Rate keeper of a real-time loop, from which telemetry reports how ticks keep their deadlines."""
@@ -216,9 +218,12 @@ class GroundSide:
         self.close()
 
     def close(self) -> None:
-        """Close the links and end the planning process."""
+        """Close the links, store what is left, and end the planning process."""
         self.links.close()
+        self._writer.close()
         if isinstance(self._executor, ProcessPoolExecutor):
+            for process in list(self._executor._processes.values()):  # Python 3.14: kill_workers()
+                process.kill()  # no plan is wanted any more, and one that still loads its code would be waited for
             self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _run(self, teller: Teller) -> None:
@@ -279,16 +284,17 @@ class GroundSide:
         return self._executor.submit(_plan_mission, job, body)
 
     def _save(self) -> None:
-        signing, path, now_ns = self.station.signing, self._config.key_file, self.station.picture.time_ns
+        """Hand over what is to be stored to the thread that writes files; report what could not be written."""
+        store, signing, now_ns = self.station.store, self.station.signing, self.station.picture.time_ns
+        if store.changed and self._config.parameter_file is not None:
+            self._writer.write(self._config.parameter_file, store.to_toml().encode())
+            store.changed = False
         may_wait = signing.key == self._saved_key and now_ns - self._saved_ns < _SAVE_EVERY_NS
-        if path is None or not signing.changed or may_wait:
-            return
-        self._saved_ns, self._saved_key = now_ns, signing.key
-        try:
-            signing.save(path)
-        except OSError as error:
-            signing.changed = False
-            self.station.say(f"signing key is not stored: {error.strerror}")
+        if signing.changed and self._config.key_file is not None and not may_wait:
+            self._writer.write(self._config.key_file, signing.to_json().encode(), FILE_MODE)
+            self._saved_ns, self._saved_key, signing.changed = now_ns, signing.key, False
+        for path, error in self._writer.failures():
+            self.station.say(f"the next start will not know what was changed: {path.name} is not stored: {error.strerror}")
 
 
 def _signing_of(config: GroundConfig) -> Signing:

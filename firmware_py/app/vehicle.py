@@ -186,6 +186,8 @@ def run_vehicle(
         stack.enter_context(quiet_garbage())
         teller.say(f"messages count modules from 0: {', '.join(f'{k} is number {fleet.label(k)}' for k in range(len(fleet.module)))}")
         teller.say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
+        if notifier is not None:
+            stack.callback(notifier.send, "STOPPING=1")  # the first of what ends: now TimeoutStopSec counts, and no longer the watchdog
         loop.run(operator.is_done)
         if recorder is not None and loop.last is not None:
             recorder.record_times(loop.last.tick, loop.last.time_ns, loop.rate_keeper)

@@ -16,7 +16,6 @@ import numpy as np
 from firmware_py.core.types import WARNING, Action
 from firmware_py.description.parameters import Parameters, changed, registry
 from firmware_py.description.schema import DescriptionError, Limits
-from firmware_py.ground.files import write_atomically
 from firmware_py.ground.stored_parameters import differences_toml, with_stored_values
 from firmware_py.ground.system import Arrival, Handler, System
 
@@ -33,7 +32,9 @@ class ParameterStore:
 
     def __init__(self, parameters: Parameters, path: Path | None = None) -> None:
         """Overlays `parameters`, with which the process was started, with the values stored in `path`. Raises DescriptionError."""
-        self._path, self._started = path, parameters
+        self._started = parameters
+        self.changed = False
+        """Whether there is something to store. Whoever stores it clears this."""
         self.values = with_stored_values(parameters, path)
         self.names: dict[str, tuple[str, Limits]] = {
             limits.mavlink: (dotted, limits) for dotted, limits in registry() if limits.mavlink
@@ -46,22 +47,22 @@ class ParameterStore:
         return float(attrgetter(self.names[name][0])(self.values))
 
     def set(self, name: str, value: float, is_armed: bool = False) -> tuple[str, float]:
-        """Changes one parameter; if its value is new, stores all parameters that differ from those at start. Returns the name in the
-        registry and the value as kept.
+        """Changes one parameter. Returns the name in the registry and the value as kept.
 
         Raises:
             DescriptionError: out of range, or in flight (`is_armed`) in contradiction with another parameter.
-            OSError: it cannot be stored; the old value stays.
         """
         dotted, _ = self.names[name]
         before = attrgetter(dotted)(self.values)
         kind = type(before)
         kept = kind(value) if kind is not int else round(value)
-        after = changed(self.values, dotted, kept, is_armed)
-        if self._path is not None and kept != before:
-            write_atomically(self._path, differences_toml(after, self._started).encode())
-        self.values = after
+        self.values = changed(self.values, dotted, kept, is_armed)
+        self.changed = self.changed or kept != before
         return dotted, kept
+
+    def to_toml(self) -> str:
+        """Returns all parameters that differ from those at start, as the constructor reads them."""
+        return differences_toml(self.values, self._started)
 
 
 class ParameterService:
@@ -107,10 +108,8 @@ class ParameterService:
             if not math.isfinite(value):
                 raise DescriptionError(f"parameter {name}: {value} is no number")
             dotted, kept = self._store.set(name, value, self._system.subject.picture.any_armed)
-        except (DescriptionError, OSError) as error:
-            stays = f"parameter {name} stays, it cannot be stored"
-            wrong = self._in_words_of_clients(str(error))
-            self._system.say(WARNING, f"{stays}: {error.filename}: {error.strerror}" if isinstance(error, OSError) else wrong)
+        except DescriptionError as error:
+            self._system.say(WARNING, self._in_words_of_clients(str(error)))
             self._system.send(arrival.channel, "PARAM_VALUE", self._value(name))
             return
         self._system.ask(Action.SET_PARAMETER, (dotted, kept))  # applies to every body

@@ -12,9 +12,8 @@ from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from firmware_py.ground.files import write_atomically
-
 KEY_BYTES = 32
+FILE_MODE = 0o600
 SIGNATURE_BYTES = 13
 EPOCH_S = 1_420_070_400
 """1 January 2015 as Unix time."""
@@ -55,7 +54,7 @@ class Signing:
     counts: Counter[str] = field(default_factory=Counter)
     """Frames by outcome: good, unsigned, bad, ahead, replayed, old, full."""
     changed: bool = False
-    """Whether there is something to store."""
+    """Whether there is something to store. Whoever stores it clears this."""
 
     def advance(self, unix_ns: int) -> None:
         """Follows the clock. Neither clock nor time stamp goes back, since stations continue from the time stamps that they heard."""
@@ -112,12 +111,10 @@ class Signing:
         self.changed = True
         return True
 
-    def save(self, path: Path) -> None:
-        """Stores key and time stamp in a file that only its owner may read. Raises OSError."""
+    def to_json(self) -> str:
+        """Returns key and time stamp as `load_signing` reads them, from a file that only its owner may read (FILE_MODE)."""
         newest = max([self.floor - _FLOOR_MARGIN, *self.streams.values()])
-        table = {"key": self.key.hex() if self.key else "", "timestamp": newest + _FLOOR_MARGIN}
-        write_atomically(path, json.dumps(table).encode(), 0o600)
-        self.changed = False
+        return json.dumps({"key": self.key.hex() if self.key else "", "timestamp": newest + _FLOOR_MARGIN})
 
 
 def load_signing(path: Path) -> Signing:

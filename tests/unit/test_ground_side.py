@@ -1,7 +1,9 @@
 """The ground side beside the tick: who is trusted, what is handed over in time, and failures that do no harm."""
 
+import os
 import socket
 import struct
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, closing, suppress
@@ -108,16 +110,60 @@ def test_parameters_that_come_at_once_all_reach_the_flight_of_a_fleet() -> None:
     assert [request.argument[0] for request in asked] == [dotted for dotted, _ in wanted.values()]
 
 
-def test_new_key_is_stored_at_once_for_the_robot_may_be_restarted_next(tmp_path: Path) -> None:
-    firmware = firmware_of(bodies=Robot().bodies)
-    config = GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",), store=str(tmp_path))
-    with closing(GroundSide(config, firmware, ThreadPoolExecutor(1))) as side:
+def side_with_store(store: Path) -> GroundSide:
+    config = GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",), store=str(store))
+    return GroundSide(config, firmware_of(bodies=Robot().bodies), ThreadPoolExecutor(1))
+
+
+@pytest.mark.parametrize("keys", [1, 2, 3])
+def test_new_key_is_stored_at_once_for_the_robot_may_be_restarted_next(keys: int, tmp_path: Path) -> None:
+    with closing(side_with_store(tmp_path)) as side:
         robot = Robot()
         pump(side, robot, 200)
-        for key in (bytes(range(32)), bytes(range(1, 33)), bytes(32)):
+        for key in (bytes(range(32)), bytes(range(1, 33)), bytes(32))[:keys]:
             side.station.signing.adopt(key, 0)
             pump(side, robot)
-            assert load_signing(tmp_path / "signing.json").key == side.station.signing.key
+    assert load_signing(tmp_path / "signing.json").key == side.station.signing.key
+    assert (tmp_path / "signing.json").stat().st_mode & 0o777 == 0o600
+
+
+def test_stop_is_heard_while_the_disk_stands_still(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: the thread that hears stops waited for the disk at each PARAM_SET, for seconds on a bad memory card."""
+    client, disk, written = mavlink.MAVLink(None, srcSystem=255, srcComponent=190), threading.Event(), threading.Event()
+    fsync = os.fsync
+
+    def stand_still(descriptor: int) -> None:
+        written.set()
+        assert disk.wait(60.0)
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", stand_still)
+    with closing(side_with_store(tmp_path)) as side:
+        pump(side, robot := Robot(), 2)
+        for message in (
+            mavlink.MAVLink_param_set_message(1, 1, b"POS_BW", 2.5, 9),
+            mavlink.MAVLink_command_long_message(1, 1, mavlink.MAV_CMD_DO_FLIGHTTERMINATION, 0, 1.0, 0, 0, 0, 0, 0, 0),
+        ):
+            side.station.take(0, bytes(message.pack(client)), 0)
+            asked = pump(side, robot)
+        assert written.wait(60.0), "the disk has work"
+        assert Action.ESTOP in [request.action for request in asked]
+        disk.set()
+    assert "position_bandwidth = 2.5" in (tmp_path / "parameters.toml").read_text()
+
+
+def test_store_that_is_gone_is_reported_once_and_the_parameter_applies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    client, said = mavlink.MAVLink(None, srcSystem=255, srcComponent=190), []
+    with closing(side_with_store(tmp_path / "store")) as side:
+        monkeypatch.setattr(side.station, "say", said.append)
+        (tmp_path / "store").write_text("")
+        pump(side, robot := Robot(), 2)
+        side.station.take(0, bytes(mavlink.MAVLink_param_set_message(1, 1, b"POS_BW", 2.5, 9).pack(client)), 0)
+        (request,) = pump(side, robot)
+        side._writer.close()
+        pump(side, robot)
+    assert request.argument == ("control.position_bandwidth", 2.5)
+    assert said == ["the next start will not know what was changed: parameters.toml is not stored: File exists"]
 
 
 def test_a_tick_only_hands_over_its_results() -> None:

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from firmware_py.core.types import Action
-from firmware_py.ground.signing import Signing, load_signing, units_of
+from firmware_py.ground.files import write_atomically
+from firmware_py.ground.signing import FILE_MODE, Signing, load_signing, units_of
 from tests.unit.ground_world import Client, World
 
 KEY = bytes(range(1, 33))
@@ -140,7 +141,7 @@ def test_key_file_is_the_owners_alone_and_its_time_goes_on(tmp_path: Path) -> No
     signing = Signing()
     signing.adopt(KEY, NOW)
     signing.streams[(0, 255, 190)] = NOW + 500
-    signing.save(path)
+    write_atomically(path, signing.to_json().encode(), FILE_MODE)
     assert path.stat().st_mode & 0o777 == 0o600
     again = load_signing(path)
     assert again.key == KEY and again.floor > NOW + 500 and again.timestamp == again.floor
@@ -148,7 +149,7 @@ def test_key_file_is_the_owners_alone_and_its_time_goes_on(tmp_path: Path) -> No
 
 def test_a_key_file_that_is_open_or_broken_is_no_reason_to_fly_without_key(tmp_path: Path) -> None:
     path = tmp_path / "signing.json"
-    Signing(key=KEY).save(path)
+    path.write_text(Signing(key=KEY).to_json())
     path.chmod(0o640)
     with pytest.raises(ValueError, match="chmod 600"):
         load_signing(path)

@@ -4,8 +4,10 @@ import errno
 import os
 import re
 import signal
+import socket
 import threading
 from collections.abc import Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.runtime import teller
 from firmware_py.runtime.flight_log import FlightLog
 from firmware_py.runtime.interrupts import endings_of_a_run, handled
+from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.recorder import Recorder
 from tests.unit.vehicle_runs import bus_of, fly
 
@@ -82,6 +85,20 @@ def test_vehicle_says_that_a_bus_takes_no_frames(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(VirtualLink, "send", refuse)
     run_vehicle(single(bus=bus_of(tmp_path)), Parameters(), say=say)
     assert any(re.search(f"bus {bus_of(tmp_path)}: in the last second [0-9]+ full$", line) for line in said)
+
+
+def test_service_manager_hears_that_the_process_ends_before_the_rest_of_it_does(tmp_path: Path) -> None:
+    """A process that ends by itself, asked by a ground station, would else be killed by the watchdog while it closes its log."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.setblocking(False)
+        with closing(Notifier.of({"NOTIFY_SOCKET": str(tmp_path / "notify")})) as notifier:
+            fly(tmp_path, tmp_path / "log", notifier=notifier)
+        heard = []
+        with suppress(BlockingIOError):
+            while True:
+                heard.append(manager.recv(4096).decode())
+    assert heard[-1] == "STOPPING=1" and heard.count("STOPPING=1") == 1
 
 
 @pytest.mark.slow

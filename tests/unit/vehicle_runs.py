@@ -8,6 +8,7 @@ from pathlib import Path
 from firmware_py.app.vehicle import run_vehicle
 from firmware_py.description.fleet import Fleet, single
 from firmware_py.description.parameters import Parameters
+from firmware_py.runtime.notify import Notifier
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG
 
 LOGS = (CAN_LOG, SIGNAL_LOG)
@@ -20,7 +21,7 @@ def bus_of(path: Path) -> str:
 
 def fly(
     tmp_path: Path, out: Path | None = None, then: Callable[[], None] = lambda: None, parameters: Parameters | None = None,
-    fleet: Fleet | None = None, hold: bool = False, ending: signal.Signals = signal.SIGTERM,
+    fleet: Fleet | None = None, hold: bool = False, ending: signal.Signals = signal.SIGTERM, notifier: Notifier | None = None,
 ) -> list[str]:  # fmt: skip
     """Runs the process and signals its end as soon as it says that it runs; `then` runs in the thread that says so. Returns the lines."""
     said: list[str] = []
@@ -31,7 +32,7 @@ def fly(
             os.kill(os.getpid(), ending)
             then()
 
-    run_vehicle(fleet or single(bus=bus_of(tmp_path)), parameters or Parameters(), hold=hold, out=out, say=say)
+    run_vehicle(fleet or single(bus=bus_of(tmp_path)), parameters or Parameters(), hold=hold, out=out, say=say, notifier=notifier)
     return said
 
 
