@@ -10,7 +10,8 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import Setpoint
-from firmware_py.ground.mission_flight import GO_TO, Leg, Plan, PlanJob
+from firmware_py.ground.mission_flight import Plan, PlanJob
+from firmware_py.ground.mission_legs import GO_TO, Leg
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, distinct, plan
 from firmware_py.prepare.piecewise import Piecewise
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -27,6 +26,7 @@ from firmware_py.ground.mission_items import (
     beyond_fence,
     flight_order,
 )
+from firmware_py.ground.mission_legs import GO_TO, Flight, Leg
 from firmware_py.ground.system import NS_PER_S, System
 from firmware_py.ground.telemetry import ACTIVE, DONE, NO_MISSION, PAUSED, READY, mission_current
 
@@ -35,24 +35,8 @@ _SETTLE_TICKS = 3
 _HOLD_TICKS = 100
 """Ticks from the request of a hold until it must be in force; ticks queued while the loop took the request count too."""
 _REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
-GO_TO = -1
-"""Sequence number of a leg that belongs to no mission."""
 _PRESENT = -1
 """DO_SET_MISSION_CURRENT's number for the current item."""
-
-
-class Leg(NamedTuple):
-    """A place to go to."""
-
-    sequence: int
-    p_wb: np.ndarray | None
-    """(3,) m; None: the present place."""
-    yaw: float | None
-    """rad; None: unchanged."""
-    hold_s: float
-    """Time to stay; above 0 the body stops there."""
-    speed_m_s: float
-    """NaN, until planned: the speed of missions at that time."""
 
 
 class PlanJob(NamedTuple):
@@ -68,38 +52,13 @@ class PlanJob(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """A planned flight; `arrivals_s` are the times at which the legs' places are reached."""
+    """A planned flight; `arrivals_s` are the times from its start at which the legs' places are to be reached."""
 
     serial: int
     trajectory: Trajectory | None
     arrivals_s: tuple[float, ...]
     reason: str = ""
     """Why there is no trajectory."""
-
-
-@dataclass(slots=True)
-class _Flight:
-    """A flight under way, or waiting for its plan."""
-
-    legs: tuple[Leg, ...]
-    plan_inputs: tuple[Any, ...]
-    """All inputs of the plan, except the start pose."""
-    arrivals_s: tuple[float, ...] = ()
-    task_changes: int = 0
-    """System.task_changes when the flight was requested; while it is tracked, as of the last tick."""
-    members: tuple[int, ...] = ()
-    """Fleet indices of the body's modules when the flight was requested: it is planned for these."""
-    hold_reached: bool = False
-    """Whether the hold in which the body waits for the plan has been in force."""
-    started_ns: int | None = None
-    reached: int = 0
-    replaced: bool = False
-    """Whether the flight belongs to the previous mission; then nothing of the present one is flown."""
-
-    @property
-    def of_mission(self) -> bool:
-        """Whether the flight belongs to a mission, rather than going to a single place."""
-        return self.legs[0].sequence != GO_TO
 
 
 class MissionFlight:
@@ -111,7 +70,7 @@ class MissionFlight:
         self.jobs: list[PlanJob] = []
         """Flights to be planned; the planner takes them."""
         self._serial = 0
-        self._flight: _Flight | None = None
+        self._flight: Flight | None = None
         self._remaining_legs: tuple[Leg, ...] = ()
         """Legs left of a paused mission: jumps already made are not repeated."""
         self._started_at_item: int | None = None
@@ -280,7 +239,7 @@ class MissionFlight:
         self._system.say(WARNING, f"flight ended before it began: {reason}")
         self._end(PAUSED)
 
-    def _reason_to_abandon(self, flight: _Flight) -> str:
+    def _reason_to_abandon(self, flight: Flight) -> str:
         """Returns why the body no longer waits for a flight; empty while it does."""
         s = self._system.subject
         mode = s.picture.mode(s.body)
@@ -327,22 +286,42 @@ class MissionFlight:
             return False
         return flight.plan_inputs == self._plan_inputs(legs)
 
-    def _advance(self, flight: _Flight, time_ns: int) -> None:
+    def _advance(self, flight: Flight, time_ns: int) -> None:
         assert flight.started_ns is not None
-        p, t = self._system.subject.progress, (time_ns - flight.started_ns) / NS_PER_S
-        while flight.reached < len(flight.legs) and t >= flight.arrivals_s[flight.reached]:
-            sequence = flight.legs[flight.reached].sequence
-            flight.reached += 1
-            if sequence != GO_TO and not flight.replaced:
-                self._system.broadcast("MISSION_ITEM_REACHED", {"seq": sequence})
-                self._repeat = [(sequence, time_ns + n * _REACHED_EVERY_NS) for n in range(1, _REACHED_REPEATS)]
-                if flight.reached < len(flight.legs):
-                    p.current = flight.legs[flight.reached].sequence
+        t_s = (time_ns - flight.started_ns) / NS_PER_S
+        while flight.reached < len(flight.legs) and t_s >= flight.arrivals_s[flight.reached]:
+            leg = flight.legs[flight.reached]
+            away_m = self._away_m(leg)
+            if not away_m <= leg.acceptance_m:
+                self._tell_if_late(flight, t_s, away_m)
+                return
+            flight.reach(t_s)
+            self._tell_reached(flight, leg.sequence, time_ns)
         last = flight.legs[-1]
-        if flight.reached == len(flight.legs) and t >= flight.arrivals_s[-1] + last.hold_s:
+        if flight.reached == len(flight.legs) and t_s >= flight.reached_s + last.hold_s:
             if last.sequence != GO_TO:
                 self._system.say(INFORMATION, "mission complete")
             self._end(DONE)
+
+    def _away_m(self, leg: Leg) -> float:
+        """Distance between the body and the leg's place, 0 if it has none; NaN without an estimate."""
+        s = self._system.subject
+        return 0.0 if leg.p_wb is None else s.picture.distance(s.body, leg.p_wb)
+
+    def _tell_reached(self, flight: Flight, sequence: int, time_ns: int) -> None:
+        if sequence == GO_TO or flight.replaced:
+            return
+        self._system.broadcast("MISSION_ITEM_REACHED", {"seq": sequence})
+        self._repeat = [(sequence, time_ns + n * _REACHED_EVERY_NS) for n in range(1, _REACHED_REPEATS)]
+        if flight.reached < len(flight.legs):
+            self._system.subject.progress.current = flight.legs[flight.reached].sequence
+
+    def _tell_if_late(self, flight: Flight, t_s: float, away_m: float) -> None:
+        if flight.becomes_late(t_s) and not flight.replaced:
+            sequence = flight.legs[flight.reached].sequence
+            what = "flight" if sequence == GO_TO else f"mission item {sequence}"
+            where = "its pose is unknown" if math.isnan(away_m) else f"{away_m:.2f} m from its place"
+            self._system.say(WARNING, f"{what} is late: {where}")
 
     def _tell_again(self, time_ns: int) -> None:
         while self._repeat and self._repeat[0][1] <= time_ns:
@@ -355,7 +334,7 @@ class MissionFlight:
         self._serial += 1  # makes a plan still in progress obsolete
         self._system.ask(Action.SET_MODE, Mode.POSHOLD)
         changes, members = self._system.task_changes, s.picture.members(s.body)
-        self._flight = _Flight(tuple(legs), self._plan_inputs(legs), task_changes=changes, members=members)
+        self._flight = Flight(tuple(legs), self._plan_inputs(legs), task_changes=changes, members=members)
         self._plan_at_tick, self._hold_by_tick = s.picture.ticks + _SETTLE_TICKS, s.picture.ticks + _HOLD_TICKS
 
     def _end(self, state: int) -> None:
@@ -384,7 +363,7 @@ class MissionFlight:
                 speed = item.speed_m_s if item.speed_m_s > 0 else math.nan
             place = item.place(origin)
             if place is not None:
-                legs.append(Leg(item.sequence, place, item.yaw if turns else None, item.hold_s, speed))
+                legs.append(Leg(item.sequence, place, item.yaw if turns else None, item.hold_s, speed, item.acceptance_m))
             elif item.delay_s > 0:
                 last = legs.pop() if legs else Leg(item.sequence, None, None, 0.0, speed)
                 legs.append(last._replace(hold_s=last.hold_s + item.delay_s))

@@ -12,6 +12,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.estimator import ADRIFT_NS
 from firmware_py.core.failsafes import Level
+from firmware_py.core.rotations import rotate_back
 from firmware_py.core.transitions import ARMED, State
 from firmware_py.core.types import CHANNELS, FACES, NEVER_NS, BodyRecord, Estimate, Event, Inputs, Mode, ModuleInputs, Outputs
 from firmware_py.description.parameters import Supervision
@@ -162,6 +163,18 @@ class Picture:
         if record is None or not record.estimate.ready:
             return False
         return record.estimate.tag_age_ns <= self._supervision.tag_fresh_ms * 1e6
+
+    def distance(self, body: int, place: np.ndarray) -> float:
+        """Distance between the body's estimate and a place (3,) in the world, m; NaN without a pose. Passive axes do not count: buoyancy
+        holds the body along them, wherever a plan wants it.
+        """
+        record = self.records.get(body)
+        if record is None or not record.estimate.ready:
+            return math.nan
+        gap_b = rotate_back(record.estimate.q_wb, place - record.estimate.p_wb)
+        passive = self.bodies[body].passive if body in self.bodies else ()
+        gap_b[[axis for axis in passive if axis < 3]] = 0.0
+        return float(np.linalg.norm(gap_b))
 
     def may_arm(self, body: int) -> bool:
         """Whether ARM would be granted."""

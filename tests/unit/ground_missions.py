@@ -1,4 +1,4 @@
-"""Missions as a client sends them, flown along a plan whose set-point stands still."""
+"""Missions as a client sends them, flown along a plan that jumps from place to place."""
 
 import numpy as np
 
@@ -11,13 +11,24 @@ PLACES = [(302084010, 1201614010, -0.4), (302084020, 1201614000, -0.3), (3020840
 
 
 class Path:
-    """A trajectory that stands still for ten seconds per leg."""
+    """A trajectory that jumps to each leg's place at its time and stands still in between."""
 
-    duration_s = 30.0
+    def __init__(self, job: PlanJob, arrivals_s: tuple[float, ...]) -> None:
+        self.duration_s = arrivals_s[-1]
+        self._stops = [(0.0, job.p_wb)]
+        for at_s, leg in zip(arrivals_s, job.legs, strict=True):
+            self._stops.append((at_s, self._stops[-1][1] if leg.p_wb is None else leg.p_wb))
 
     def sample(self, t_s: float) -> Setpoint:
         zero = np.zeros(3)
-        return Setpoint(zero, np.array([1.0, 0, 0, 0]), zero, zero, zero, zero)
+        p_wb = [place for at_s, place in self._stops if at_s <= max(t_s, 0.0)][-1]
+        return Setpoint(p_wb, np.array([1.0, 0, 0, 0]), zero, zero, zero, zero)
+
+
+def plan_of(job: PlanJob, first_arrival_s: float = 10.0) -> Plan:
+    """A plan that takes the same time for each leg."""
+    arrivals = tuple(first_arrival_s * (i + 1) for i in range(len(job.legs)))
+    return Plan(job.serial, Path(job, arrivals), arrivals)
 
 
 def item(
@@ -69,8 +80,7 @@ def go_to(world: World, client: Client) -> PlanJob:
 def fly(world: World, client: Client, first_arrival_s: float = 10.0) -> PlanJob:
     """Arms, starts the mission by mode and delivers the plan, which the body then tracks; returns what was planned."""
     job = begin(world, client)
-    arrivals = tuple(first_arrival_s * (i + 1) for i in range(len(job.legs)))
-    world.station.planned(0, Plan(job.serial, Path(), arrivals))
+    world.station.planned(0, plan_of(job, first_arrival_s))
     world.run(3)
     return job
 

@@ -43,7 +43,7 @@ def fleet_of(modules: int, altitude_m: float = 0.0) -> Fleet:
 
 
 class Robot:
-    """Answers requests as the supervisor would, and stands still where it is put."""
+    """Answers requests as the supervisor would. It stands still where it is put, and is at once where a plan that it tracks wants it."""
 
     def __init__(self, modules: int = 1) -> None:
         self.tick = 0
@@ -51,6 +51,10 @@ class Robot:
         self.mode = [Mode.POSHOLD] * modules
         self.p_wb = [np.array([0.1 * n, 0.2, 0.5]) for n in range(modules)]
         self.q_wb = [from_euler(0.1, -0.2, 0.3) for _ in range(modules)]
+        self.tracked: list[tuple[int, Any] | None] = [None] * modules
+        """Tick at which each module began to track, and the trajectory."""
+        self.off_plan = np.zeros(3)
+        """How far from its place in a plan the robot is held, m."""
         self.nu = np.array([0.05, 0.0, -0.02, 0.01, 0.02, 0.03])
         self.tag_age_ns, self.ready, self.may_arm, self.level = 30_000_000, True, True, Level.NONE
         self.refuse: dict[Action, str] = {}
@@ -58,11 +62,11 @@ class Robot:
         self.asked: list[Request] = []
         self.events: list[Event] = []
         """Events of the next tick."""
-        self.bodies: list[Any] = [SimpleNamespace(index=n, modules=(n,)) for n in range(modules)]
+        self.bodies: list[Any] = [SimpleNamespace(index=n, modules=(n,), passive=()) for n in range(modules)]
 
     def dock(self) -> None:
         """Makes all modules one body from now on."""
-        self.bodies = [SimpleNamespace(index=0, modules=tuple(range(len(self.state))))]
+        self.bodies = [SimpleNamespace(index=0, modules=tuple(range(len(self.state))), passive=())]
 
     def step(self, requests: list[Request]) -> tuple[Inputs, Outputs]:
         self.tick += 1
@@ -70,6 +74,7 @@ class Robot:
         modules = [self._inputs() for _ in self.state]
         events = [*self.events, *(event for request in requests for event in self._take(request))]
         self.events = []
+        self._move()
         commands = [ModuleCommand(s == State.ARMED, np.linspace(-1, 1, 8), None) for s in self.state]
         records = [self._record(body.index) for body in self.bodies]
         return Inputs(self.tick, time_ns, modules, requests), Outputs(
@@ -103,8 +108,14 @@ class Robot:
         elif action == Action.HOLD:
             self.mode[body] = Mode.POSHOLD
         elif action == Action.TRACK:
-            self.mode[body] = Mode.AUTO
+            self.mode[body], self.tracked[body] = Mode.AUTO, (self.tick, request.argument)
         return []
+
+    def _move(self) -> None:
+        for n, tracked in enumerate(self.tracked):
+            if tracked is not None and self.mode[n] == Mode.AUTO:
+                began, trajectory = tracked
+                self.p_wb[n] = trajectory.sample((self.tick - began) * PERIOD_NS / 1e9).p_wb + self.off_plan
 
     def _record(self, body: int) -> BodyRecord:
         estimate = Estimate(

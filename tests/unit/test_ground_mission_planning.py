@@ -9,7 +9,7 @@ from firmware_py.app.mission_plan import plan_mission
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode
 from firmware_py.ground.mission_flight import Plan, PlanJob
-from tests.unit.ground_missions import PLACES, Path, begin, continued, go_to, item, upload
+from tests.unit.ground_missions import PLACES, begin, continued, go_to, item, plan_of, upload
 from tests.unit.ground_world import Client, World
 
 
@@ -29,7 +29,7 @@ def test_plan_that_comes_after_something_else_was_asked_for_is_not_flown(world: 
     old = begin(world, client)
     client.command(224, 2)
     world.run(ticks)
-    world.station.planned(0, Plan(old.serial, Path(), (10.0, 20.0, 30.0)))
+    world.station.planned(0, plan_of(old))
     world.run(3)
     assert Action.TRACK not in [r.action for r in world.robot.asked]
 
@@ -43,7 +43,7 @@ def planning(world: World, client: Client) -> PlanJob:
 
 
 def come_back(world: World, job: PlanJob) -> None:
-    world.station.planned(0, Plan(job.serial, Path(), tuple(10.0 * (i + 1) for i in range(len(job.legs)))))
+    world.station.planned(0, plan_of(job))
 
 
 TAKEN = {
@@ -154,7 +154,7 @@ def test_mission_of_a_robot_that_was_part_of_another_meanwhile_is_not_complete_b
     world.robot.state[1] = State.ARMED
     come_back(world, planning(world, client))
     world.run(1100)
-    world.robot.bodies = [SimpleNamespace(index=1, modules=(0, 1))]
+    world.robot.bodies = [SimpleNamespace(index=1, modules=(0, 1), passive=())]
     world.run(3000)
     client.clear()
     world.robot.bodies, world.robot.mode[0] = apart, Mode.POSHOLD

@@ -6,8 +6,7 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.core.types import Action, Mode
 from firmware_py.ground.config import GroundConfig
-from firmware_py.ground.mission_flight import Plan
-from tests.unit.ground_missions import PLACES, Path, continued, fly, item, upload
+from tests.unit.ground_missions import PLACES, continued, fly, item, plan_of, upload
 from tests.unit.ground_requests import NAN
 from tests.unit.ground_world import Client, World
 
@@ -176,7 +175,7 @@ def test_start_that_comes_again_because_its_answer_was_lost_does_not_begin_the_m
     world.run(10)
     (job,) = world.station.jobs()
     assert job.legs[0].sequence == begun
-    world.station.planned(0, Plan(job.serial, Path(), (10.0, 20.0, 30.0)[: len(job.legs)]))
+    world.station.planned(0, plan_of(job))
     world.run(1100)
     client.clear()
     client.command(300, first)
@@ -234,7 +233,7 @@ def test_jump_that_comes_again_because_its_answer_was_lost_flies_on(
     jump()
     jump()
     (job,) = world.station.jobs()
-    world.station.planned(0, Plan(job.serial, Path(), (10.0, 20.0)))
+    world.station.planned(0, plan_of(job))
     world.run(3 + flown_ticks)
     jump()
     assert world.station.jobs() == [] and world.robot.mode[0] == Mode.AUTO
@@ -283,7 +282,7 @@ def test_start_that_comes_again_while_its_mission_is_planned_is_waited_for_once(
         client.command(300, 0)
         world.run(10)
     (job,) = world.station.jobs()
-    world.station.planned(0, Plan(job.serial, Path(), (10.0, 20.0, 30.0)))
+    world.station.planned(0, plan_of(job))
     world.run(3)
     assert world.robot.mode[0] == Mode.AUTO
 

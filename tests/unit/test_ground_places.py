@@ -8,8 +8,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.core.types import Mode
 from firmware_py.ground.geodesy import Origin
-from firmware_py.ground.mission_flight import Plan, PlanJob
-from tests.unit.ground_missions import PLACES, Path, fly, item, upload
+from firmware_py.ground.mission_flight import PlanJob
+from tests.unit.ground_missions import PLACES, fly, item, plan_of, upload
 from tests.unit.ground_requests import NAN, ask
 from tests.unit.ground_world import Client, World
 
@@ -61,7 +61,7 @@ def test_reposition_that_comes_again_because_its_answer_was_lost_flies_on(world:
     ask(world, client, 400, 1)
     (job,) = go()
     assert go() == [], "its plan is waited for once"
-    world.station.planned(0, Plan(job.serial, Path(), (10.0,)))
+    world.station.planned(0, plan_of(job))
     world.run(300)
     assert go() == [] and world.robot.mode[0] == Mode.AUTO
     assert client.last("COMMAND_ACK").result == mavlink.MAV_RESULT_ACCEPTED

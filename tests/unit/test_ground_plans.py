@@ -14,7 +14,8 @@ import pytest
 
 from firmware_py.app.ground_station import _WARM_UP_JOB, GroundSide
 from firmware_py.ground.config import GroundConfig
-from firmware_py.ground.mission_flight import Leg, Plan, PlanJob
+from firmware_py.ground.mission_flight import Plan, PlanJob
+from firmware_py.ground.mission_legs import Leg
 from tests.unit.ground_sides import PATIENCE_S, firmware_of, free_port, side_on
 
 
