@@ -128,3 +128,15 @@ def test_motor_test_of_one_body_becomes_no_flight_when_it_is_docked_to() -> None
     joined = Supervisor(P)
     joined.take_over([stopped, supervisor_in()])
     assert joined.state == State.ESTOP
+
+
+def test_motor_detect_goes_on_in_the_parts_of_a_body_but_not_in_what_is_joined() -> None:
+    """Nothing holds a body in MOTOR_DETECT: what has docked to one in flight would sink with it."""
+    detecting, pilot = supervisor_in(mode=Mode.MOTOR_DETECT), supervisor_in(mode=Mode.STABILIZE)
+    for before, mode in (
+        ([detecting], Mode.MOTOR_DETECT), ([detecting, supervisor_in(mode=Mode.DOCK)], Mode.POSHOLD), ([detecting, pilot], Mode.STABILIZE),
+        ([pilot, detecting], Mode.STABILIZE),
+    ):  # fmt: skip
+        after = Supervisor(P)
+        after.take_over(before)
+        assert (after.state, after.mode) == (State.ARMED, mode)
