@@ -93,7 +93,7 @@ class GroundSide:
         unix_now_ns: the time of day, for signing.
         priority: SCHED_FIFO priority of the thread, for use with a real-time loop; 0: an ordinary thread.
         started: parameters before the stored ones were laid over them; None: the firmware's.
-        say: receives one line about the first error, in its own thread.
+        say: receives one line about each link that is not there yet, and about the first error, in its own thread.
     """
 
     def __init__(
@@ -222,6 +222,8 @@ class GroundSide:
             self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _run(self, teller: Teller) -> None:
+        for warning in self.links.warnings:
+            teller.say(f"warning: {warning}")
         self._try(self._start_planner, teller)
         if self._priority:
             use_priority(self._priority)  # a refusal was reported by the loop already
