@@ -18,6 +18,7 @@ import serial
 from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.core.types import Action, Event
+from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.link import Links
 from firmware_py.ground.signing import Signing
 from firmware_py.ground.telemetry import DEFAULT_HZ
@@ -112,8 +113,8 @@ def test_torn_frame_of_a_link_that_is_gone_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize("trusted", [False, True])
-def test_key_behind_a_torn_frame_is_taken_from_a_trusted_link_alone(trusted: bool) -> None:
-    world = World()
+def test_key_behind_a_torn_frame_is_taken_from_a_trusted_link_alone(trusted: bool, tmp_path: Path) -> None:
+    world = World(config=GroundConfig(store=str(tmp_path)))
     client = world.client()
     setup = client.pack("SETUP_SIGNING", 1, 1, list(KEY), NOW)
     world.station.take(client.channel, TORN + setup, world.time_ns, datagram=False, trusted=trusted)
