@@ -37,6 +37,7 @@ from firmware_py.ground.station import GroundStation
 from firmware_py.ground.system import STOPPING
 from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import MonotonicClock, unix_ns
+from firmware_py.runtime.interrupts import signals_blocked
 from firmware_py.runtime.rate_keeper import RateKeeper
 from firmware_py.runtime.realtime import die_with, use_ordinary_priority, use_priority
 from firmware_py.runtime.teller import Teller, write_line
@@ -75,6 +76,12 @@ def _plan_mission(job: PlanJob, body: Body | None) -> Plan:
 def _planner(awaited: Awaited) -> ProcessPoolExecutor:
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(1, mp_context=context, initializer=_serve, initargs=(os.getpid(), awaited))
+
+
+def _submit(executor: Executor, job: PlanJob, body: Body | None) -> Future[Plan]:
+    """Submits a job. A process that this starts inherits the blocked Ctrl-C, which would otherwise end it before `_serve` ignores it."""
+    with signals_blocked([signal.SIGINT]):
+        return executor.submit(_plan_mission, job, body)
 
 
 def _serve(parent: int, awaited: Awaited) -> None:
@@ -268,17 +275,17 @@ class GroundSide:
         """Starts the planning process, from the thread with which it dies even when busy (`die_with`); it takes seconds to be ready."""
         if self._executor is None:
             self._executor = _planner(self._awaited)
-            self._executor.submit(_plan_mission, _WARM_UP_JOB, None)
+            _submit(self._executor, _WARM_UP_JOB, None)
 
     def _begin(self, job: PlanJob, body: Body | None) -> Future[Plan]:
         """Submits a job to the planning process, or to a new one if that was killed, as the system does when memory is short."""
         try:
             if self._executor is not None:
-                return self._executor.submit(_plan_mission, job, body)
+                return _submit(self._executor, job, body)
         except BrokenExecutor:
             pass
         self._executor = _planner(self._awaited)
-        return self._executor.submit(_plan_mission, job, body)
+        return _submit(self._executor, job, body)
 
     def _save(self) -> None:
         signing, path, now_ns = self.station.signing, self._config.key_file, self.station.picture.time_ns
