@@ -38,6 +38,7 @@ from firmware_py.ground.station import GroundStation
 from firmware_py.ground.system import STOPPING
 from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import MonotonicClock, unix_ns
+from firmware_py.runtime.interrupts import signals_blocked
 from firmware_py.runtime.rate_keeper import RateKeeper
 from firmware_py.runtime.realtime import die_with, use_ordinary_priority, use_priority
 from firmware_py.runtime.teller import Teller, write_line
@@ -78,6 +79,12 @@ def _planner(awaited: Awaited) -> ProcessPoolExecutor:
     return ProcessPoolExecutor(1, mp_context=context, initializer=_serve, initargs=(os.getpid(), awaited))
 
 
+def _submit(executor: Executor, job: PlanJob, body: Body | None) -> Future[Plan]:
+    """Submits a job. A process that this starts inherits the blocked Ctrl-C, which would otherwise end it before `_serve` ignores it."""
+    with signals_blocked([signal.SIGINT]):
+        return executor.submit(_plan_mission, job, body)
+
+
 def _serve(parent: int, awaited: Awaited) -> None:
     """Sets up the planning process to end with the vehicle's process, and to ignore the Ctrl-C that asks the vehicle to disarm first."""
     use_ordinary_priority()  # a replacement process is started by a thread of real-time priority
@@ -94,7 +101,7 @@ class GroundSide:
         unix_now_ns: the time of day, for signing.
         priority: SCHED_FIFO priority of the thread, for use with a real-time loop; 0: an ordinary thread.
         started: parameters before the stored ones were laid over them; None: the firmware's.
-        say: receives one line about the first error, in its own thread.
+        say: receives one line about each link that is not there yet, and about the first error, in its own thread.
     """
 
     def __init__(
@@ -227,6 +234,8 @@ class GroundSide:
             self._executor.shutdown(wait=True, cancel_futures=True)
 
     def _run(self, teller: Teller) -> None:
+        for warning in self.links.warnings:
+            teller.say(f"warning: {warning}")
         self._try(self._start_planner, teller)
         if self._priority:
             use_priority(self._priority)  # a refusal was reported by the loop already
@@ -271,17 +280,17 @@ class GroundSide:
         """Starts the planning process, from the thread with which it dies even when busy (`die_with`); it takes seconds to be ready."""
         if self._executor is None:
             self._executor = _planner(self._awaited)
-            self._executor.submit(_plan_mission, _WARM_UP_JOB, None)
+            _submit(self._executor, _WARM_UP_JOB, None)
 
     def _begin(self, job: PlanJob, body: Body | None) -> Future[Plan]:
         """Submits a job to the planning process, or to a new one if that was killed, as the system does when memory is short."""
         try:
             if self._executor is not None:
-                return self._executor.submit(_plan_mission, job, body)
+                return _submit(self._executor, job, body)
         except BrokenExecutor:
             pass
         self._executor = _planner(self._awaited)
-        return self._executor.submit(_plan_mission, job, body)
+        return _submit(self._executor, job, body)
 
     def _save(self) -> None:
         """Hand over what is to be stored to the thread that writes files; report what could not be written."""

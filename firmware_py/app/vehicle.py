@@ -156,7 +156,7 @@ def run_vehicle(
         for body in firmware.pipeline.bodies:
             if not body.tag_ids.size:
                 teller.say(UNTAGGED.format(" and ".join(map(fleet.label, body.modules))))
-        logged = stack.enter_context(ExitStack())  # unwinds after the log and the e-stop note are closed
+        stack.enter_context(handled(operator.stop, endings_of_a_run()))  # until the log and the e-stop note below are closed
         note = _open_note(stack, out) if out is not None else None  # before the log: of two processes started at once, one gets the folder
         notes = {"boot": boot, "apart": sorted(before.apart(firmware))}
         recorder = _open_recorder(stack, configuration_of(firmware, rate_hz=fleet.rate_hz, **notes), firmware, out, live, teller.say)
@@ -182,7 +182,8 @@ def run_vehicle(
         loop.listen()
         if out is not None and estop_stands(out) and not before.stopped:
             raise DescriptionError(f"{out}: an e-stop was raised while this process started, by one that ran until then; start it again")
-        logged.enter_context(handled(operator.stop, endings_of_a_run()))
+        if operator.stopping:  # asked before the first tick
+            return summary_of(loop)
         stack.enter_context(quiet_garbage())
         teller.say(f"messages count modules from 0: {', '.join(f'{k} is number {fleet.label(k)}' for k in range(len(fleet.module)))}")
         teller.say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")

@@ -55,7 +55,9 @@ class Links:
     """All links of one process."""
 
     def __init__(self, addresses: Sequence[str]) -> None:
-        """Opens every address. Raises LinkError, and then leaves no link open."""
+        """Opens every address, later if it is not there yet. Raises LinkError, and then leaves no link open."""
+        self.warnings: list[str] = []
+        """One line for each address that is not there yet."""
         self.counts: Counter[str] = Counter()
         self.channels: dict[int, Channel] = {}
         self.links: list[Link] = []
@@ -65,7 +67,7 @@ class Links:
         self._gone: list[int] = []
         try:
             for address in addresses:
-                self.links.append(open_link(address.removesuffix(TRUSTED)))
+                self.links.append(open_link(address.removesuffix(TRUSTED), self.warnings.append))
                 self._trusted.append(address.endswith(TRUSTED))
         except LinkError:
             self.close()

@@ -16,6 +16,8 @@ _ENTRIES_AT_ONCE = 10
 """Entries of a list sent per round: half as many frames as pieces, since each requires a look at its file."""
 _MOST_LOGS = 100
 _SUFFIXES = (".mcap", ".log")
+_FIRST_RUN, _RUN_DIGITS = 1, 4
+"""The first run logs into the folder itself, each later one into a folder in it that is named by its number, of so many digits at least."""
 
 
 @dataclass(slots=True)
@@ -45,7 +47,8 @@ class LogService:
         """By channel."""
         self._listings: dict[int, _Listing] = {}
         """By channel."""
-        self._files: list[Path] = []
+        self._files: dict[int, list[Path]] = {}
+        """By channel, as last listed there: a list for another client changes no number under which this one fetches."""
 
     def handlers(self) -> dict[str, Handler]:
         """Handlers by message name."""
@@ -58,6 +61,8 @@ class LogService:
 
     def step(self) -> None:
         """Sends the next entries of requested lists and the next pieces of requested logs."""
+        for channel in [channel for channel in self._files if channel not in self._system.channels]:
+            del self._files[channel]
         for channel, listing in list(self._listings.items()):
             if channel not in self._system.channels:
                 del self._listings[channel]
@@ -96,31 +101,33 @@ class LogService:
         """Sends the next entries of a list. The folder is read once per list, not for each request of a flood."""
         arrival = listing.arrival
         if listing.next is None:
-            self._files = self._find()
+            self._files[arrival.channel] = self._find()
             listing.next = max(arrival.message["start"], self._first)
-            if not self._files:
+            if not self._files[arrival.channel]:
                 self._system.send(arrival.channel, "LOG_ENTRY", {})
-        newest = self._first + len(self._files) - 1
+        files = self._files[arrival.channel]
+        newest = self._first + len(files) - 1
         last, first, listing.next = min(listing.last, newest), listing.next, listing.next + _ENTRIES_AT_ONCE
         if listing.next > last:
             del self._listings[arrival.channel]
         for number in range(first, min(listing.next - 1, last) + 1):
             try:
-                status = self._files[number - self._first].stat()
+                status = files[number - self._first].stat()
             except OSError:
                 continue
             values = {
-                "id": number, "num_logs": len(self._files), "last_log_num": newest,
+                "id": number, "num_logs": len(files), "last_log_num": newest,
                 "time_utc": int(status.st_mtime), "size": status.st_size,
             }  # fmt: skip
             self._system.send(arrival.channel, "LOG_ENTRY", values)
 
     def _data(self, arrival: Arrival) -> None:
         number = arrival.message["id"]
-        if not self._files:
-            self._files = self._find()
-        if number - self._first in range(len(self._files)):
-            path = self._files[number - self._first]
+        if not self._files.get(arrival.channel):
+            self._files[arrival.channel] = self._find()
+        files = self._files[arrival.channel]
+        if number - self._first in range(len(files)):
+            path = files[number - self._first]
             self._transfers[arrival.channel] = _Transfer(arrival, number, path, arrival.message["ofs"], arrival.message["count"])
 
     def _end(self, arrival: Arrival) -> None:
@@ -132,10 +139,17 @@ class LogService:
     def _find(self) -> list[Path]:
         if self._folder is None:
             return []
-        found: list[tuple[float, Path]] = []
+        found: list[Path] = []
         with suppress(OSError):  # of the folder itself
             for path in self._folder.rglob("*"):
                 with suppress(OSError):  # a file that has just been deleted
                     if path.suffix in _SUFFIXES and path.is_file():
-                        found.append((path.stat().st_mtime, path))
-        return [path for _, path in sorted(found)[-_MOST_LOGS:]]
+                        found.append(path)
+        return sorted(found, key=self._place)[-_MOST_LOGS:]
+
+    def _place(self, path: Path) -> tuple[int, tuple[str, ...]]:
+        """Orders logs by run, then by name; not by time: both logs of this run are still written, and those of a failed disk dated back."""
+        assert self._folder is not None
+        parts = path.relative_to(self._folder).parts
+        is_run = len(parts) > 1 and len(parts[0]) >= _RUN_DIGITS and parts[0].isdecimal()
+        return int(parts[0]) if is_run else _FIRST_RUN, parts

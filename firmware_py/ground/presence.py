@@ -78,7 +78,9 @@ class Presence:
             self._system.send(arrival.channel, "PING", values)
 
     def _setup_signing(self, arrival: Arrival) -> None:
-        """Sets the signing key, only while every body is disarmed and on a trusted link. The message is never forwarded or acknowledged."""
+        """Sets the signing key, only while every body is disarmed, on a trusted link, and with a store: a key that is forgotten at the next
+        start would lock nothing. The message is never forwarded or acknowledged.
+        """
         m = arrival.message
         if self._system.subject.picture.any_armed or not arrival.trusted:
             self._system.say(WARNING, "signing refused: only disarmed, and on a trusted link")
@@ -87,6 +89,9 @@ class Presence:
             self._system.say(WARNING, "signing refused: its time stamp is more than a minute ahead of the clock here")
             return
         key = bytes(m["secret_key"])
+        if any(key) and self._config.key_file is None:
+            self._system.say(WARNING, "signing refused: no --store to keep the key in")
+            return
         if len(key) == KEY_BYTES:
             self._signing.adopt(key, m["initial_timestamp"])
             self._system.say(INFORMATION, "signing key set" if any(key) else "signing is off")

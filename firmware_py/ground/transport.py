@@ -1,13 +1,15 @@
-"""Types of link to a ground station: udpin, udpout, tcpin, serial. None ever blocks."""
+"""Types of link to a ground station: udpin, udpout, tcpin, serial. None ever blocks once it is opened."""
 
 from __future__ import annotations
 
 import contextlib
 import errno
 import os
+import re
 import socket
 import termios
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from typing import Any, Protocol
 
 import serial
@@ -19,6 +21,10 @@ _LAST_PORT, _FASTEST_BAUD = 65535, 12_000_000
 """Largest 16-bit port number; fastest rate of common USB adapters (FT232H)."""
 _READS_AT_ONCE = 64
 """Most datagrams read from one socket before the next socket has its turn."""
+_NO_DEVICE = (errno.ENOENT, errno.ENODEV, errno.ENXIO)
+"""Errors of a serial device that is not plugged in."""
+_RESOLVE_EVERY_S = 2.0
+"""Interval between attempts to resolve the name of a host."""
 
 
 class LinkError(Exception):
@@ -52,15 +58,14 @@ class Link(Protocol):
 
 
 class UdpLink:
-    """udpin: answers every sender. udpout: sends to one address from the start, and accepts data from there only.
+    """udpin: answers every sender. udpout: sends to one address from the start, and accepts data from there only. Takes no host names.
 
     The socket is not connected: that would bind it to the machine's present address, and mute it once the machine gets another.
     """
 
     datagram = True
 
-    def __init__(self, host: str, port: int, listen: bool) -> None:
-        address = socket.gethostbyname(host), port
+    def __init__(self, address: tuple[str, int], listen: bool) -> None:
         self._to = None if listen else _who_answers(address)
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
@@ -125,8 +130,8 @@ class TcpLink:
 
     datagram = False
 
-    def __init__(self, host: str, port: int) -> None:
-        self._server = socket.create_server((host, port))
+    def __init__(self, address: tuple[str, int]) -> None:
+        self._server = socket.create_server(address)
         self._server.setblocking(False)
         self._left: dict[socket.socket, bytes] = {}
 
@@ -184,19 +189,66 @@ class TcpLink:
         self._server.close()
 
 
+class LateLink:
+    """A network link that could not be opened at the start. It is opened once its host has an address that this machine can use.
+
+    Each `receive` tries to open it, which takes microseconds. Only a name is resolved in a thread of its own, which may wait for seconds.
+    """
+
+    def __init__(self, kind: str, host: str, port: int, resolved: bool) -> None:
+        self.datagram = kind != "tcpin"
+        self._kind, self._port = kind, port
+        self._host = host if resolved else ""
+        """Numeric address; empty while the name is not resolved."""
+        self._link: Link | None = None
+        self._closed = threading.Event()
+        if not resolved:
+            threading.Thread(target=self._resolve, args=(host,), name="resolver", daemon=True).start()
+
+    def _resolve(self, name: str) -> None:
+        while not self._host and not self._closed.wait(_RESOLVE_EVERY_S):
+            with contextlib.suppress(OSError):
+                self._host = socket.gethostbyname(name)
+
+    def receive(self) -> list[tuple[Any, bytes]]:
+        if self._link is None and self._host:
+            with contextlib.suppress(OSError):  # its network is still down
+                self._link = _open_network(self._kind, self._host, self._port)
+        return self._link.receive() if self._link is not None else []
+
+    def send(self, peer: Any, frame: bytes) -> bool:
+        """Sends a frame; discards it while the link is not open, since old telemetry is useless."""
+        return self._link is None or self._link.send(peer, frame)
+
+    def peers(self) -> Sequence[Any]:
+        if self._link is None:
+            return [None] if self._kind == "udpout" else []
+        return self._link.peers()
+
+    def leave(self, peer: Any) -> None:
+        if self._link is not None:
+            self._link.leave(peer)
+
+    def close(self) -> None:
+        self._closed.set()
+        if self._link is not None:
+            self._link.close()
+
+
 class SerialLink:
-    """A radio or a UART of the vehicle's computer. An unplugged device is reopened when it is back."""
+    """A radio or a UART of the vehicle's computer. A device that is not plugged in is opened when it is there, or is back."""
 
     datagram = False
 
     def __init__(self, device: str, baud: int) -> None:
         self._device, self._baud = device, baud
-        self._serial: Any = self._open()
+        self._serial: Any = None
         self._left = b""
 
-    def _open(self) -> Any:
+    def open(self) -> None:
+        """Opens the device. Raises OSError."""
         try:
-            return serial.Serial(self._device, self._baud, timeout=0, write_timeout=0)
+            self._serial = serial.Serial(self._device, self._baud, timeout=0, write_timeout=0)
         except termios.error as error:  # unplugged meanwhile: not an OSError, and pyserial lets it through
             raise OSError(*error.args) from None
         except serial.SerialException as error:
@@ -205,10 +257,10 @@ class SerialLink:
             raise
 
     def _is_plugged(self) -> bool:
-        """Whether the device is open; reopens it when it is back."""
+        """Whether the device is open; opens it when it is there."""
         if self._serial is None and os.path.exists(self._device):
             with contextlib.suppress(OSError):  # udev has not granted access yet, or it was unplugged again
-                self._serial = self._open()
+                self.open()
         return self._serial is not None
 
     def _pulled(self) -> None:
@@ -256,25 +308,66 @@ class SerialLink:
             self._serial.close()
 
 
-def open_link(address: str) -> Link:
+def open_link(address: str, warn: Callable[[str], None]) -> Link:
     """Opens the link at `address`, which comes without the suffix `+trusted`.
+
+    Where a device, a network or the name of a host is not there yet, `warn` receives one line, and the link opens itself later.
 
     Raises:
         LinkError: the kind of address is unknown, or it cannot be opened.
     """
+
+    def put_off(error: OSError) -> None:
+        warn(f"link {address}: not there yet: {_reason(error)}; it is opened when it is there")
+
     try:
         if address.startswith("/"):
             device, _, baud = address.partition(",")
-            return SerialLink(device, _number(address, baud or "921600", _FASTEST_BAUD, "/dev/NAME,BAUD, as /dev/ttyTHS1,921600"))
+            rate = _number(address, baud or "921600", _FASTEST_BAUD, "/dev/NAME,BAUD, as /dev/ttyTHS1,921600")
+            return _serial_link(device, rate, put_off)
         kind, _, rest = address.partition(":")
         host, _, port = rest.rpartition(":")
         if kind in ("udpin", "udpout", "tcpin"):
             number = _number(address, port, _LAST_PORT, f"{kind}:HOST:PORT, as {kind}:{LOOPBACK}:14550, and behind it at most one +trusted")
-            host = _host(address, host or LOOPBACK)
-            return TcpLink(host, number) if kind == "tcpin" else UdpLink(host, number, kind == "udpin")
+            return _network_link(kind, _host(address, host or LOOPBACK), number, put_off)
     except (OSError, ValueError, OverflowError) as error:
         raise LinkError(f"link {address}: cannot be opened: {_reason(error)}") from None
     raise LinkError(f"link {address}: unknown; there are udpin:, udpout:, tcpin:HOST:PORT and /dev/NAME,BAUD")
+
+
+def _serial_link(device: str, baud: int, put_off: Callable[[OSError], None]) -> Link:
+    link = SerialLink(device, baud)
+    try:
+        link.open()
+    except OSError as error:
+        if error.errno not in _NO_DEVICE:
+            raise
+        put_off(error)
+    return link
+
+
+def _network_link(kind: str, host: str, port: int, put_off: Callable[[OSError], None]) -> Link:
+    numeric = ""
+    try:
+        numeric = socket.gethostbyname(host)
+        return _open_network(kind, numeric, port)
+    except OSError as error:
+        is_late = error.errno == errno.EADDRNOTAVAIL if numeric else _is_name(host)
+        if not is_late:
+            raise
+        put_off(error)
+    return LateLink(kind, numeric or host, port, bool(numeric))
+
+
+def _open_network(kind: str, host: str, port: int) -> Link:
+    """Opens a network link at a numeric address. Raises OSError."""
+    return TcpLink((host, port)) if kind == "tcpin" else UdpLink((host, port), kind == "udpin")
+
+
+def _is_name(host: str) -> bool:
+    """Whether a resolver may come to know `host`: an address that is wrong, as 10.0.0.256 or ::1, is none."""
+    last = host.removesuffix(".").rpartition(".")[2]
+    return not last.isdecimal() and re.fullmatch(r"[\w.-]+", host) is not None
 
 
 def _reason(error: Exception) -> str:

@@ -93,9 +93,12 @@ def interrupts_deferred() -> Iterator[Callable[[], None]]:
 
 
 @contextmanager
-def signals_blocked() -> Iterator[None]:
-    """Blocks Ctrl-C and SIGTERM: a child process started inside never receives them; this process receives them afterwards."""
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, ENDINGS)
+def signals_blocked(numbers: Iterable[signal.Signals] = ENDINGS) -> Iterator[None]:
+    """Blocks these signals in this thread: a child process started inside never receives them; this process receives them afterwards.
+
+    Start multiprocessing's resource tracker before, as its queues and semaphores do: its start unblocks ENDINGS.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
     finally:

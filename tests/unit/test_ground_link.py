@@ -1,9 +1,11 @@
-"""Links over loopback: several at once, routed by system, bounded, reopened, and refused in one line."""
+"""Links over loopback: several at once, routed by system, bounded, opened late, and refused in one line."""
 
+import errno
 import re
 import socket
+import threading
 import time
-from contextlib import closing
+from contextlib import closing, suppress
 from typing import Any
 
 import pytest
@@ -35,7 +37,7 @@ def test_udpin_answers_each_client_on_its_own_channel() -> None:
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 def test_an_address_without_a_host_is_this_machines_alone(kind: str) -> None:
-    link: Any = open_link(f"{kind}::0")
+    link: Any = open_link(f"{kind}::0", pytest.fail)
     with closing(link):
         assert (link._socket if kind == "udpin" else link._server).getsockname()[0] == "127.0.0.1"
 
@@ -64,7 +66,7 @@ def test_robot_on_udpout_is_tied_to_no_address_of_its_own_and_hears_nobody_but_i
     station, stranger = (socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(2))
     station.bind(("127.0.0.1", 0))
     station.settimeout(PATIENCE_S)
-    link: Any = open_link(f"udpout:127.0.0.1:{station.getsockname()[1]}")
+    link: Any = open_link(f"udpout:127.0.0.1:{station.getsockname()[1]}", pytest.fail)
     with closing(link), closing(station), closing(stranger):
         assert link.send(None, b"anybody?")
         _, robot = station.recvfrom(100)
@@ -130,11 +132,14 @@ def test_station_on_the_robots_own_machine_is_heard_by_whatever_name_of_it() -> 
 
 @pytest.mark.parametrize(
     "address",
-    ["nonsense", "udpin:127.0.0.1:no", "udpin:127.0.0.1:99999", "/dev/no-such-port,9600", "tcpin:256.0.0.1:5", "udpout:255.255.255.255:5"],
-)
+    [
+        "nonsense", "udpin:127.0.0.1:no", "udpin:127.0.0.1:99999", "tcpin:256.0.0.1:5", "tcpin:10.0.0.300.:5", "udpout:255.255.255.255:5",
+        "udpin:::1:14550", "udpout:[::1]:14550", "udpout:no name:14550", "udpout://127.0.0.1:14550",
+    ],
+)  # fmt: skip
 def test_an_address_that_cannot_be_opened_is_refused_in_one_line(address: str) -> None:
     with pytest.raises(LinkError, match="link ") as error:
-        open_link(address)
+        open_link(address, pytest.fail)
     assert "\n" not in str(error.value) and "Errno" not in str(error.value)
 
 
@@ -148,7 +153,7 @@ def test_an_address_that_cannot_be_opened_is_refused_in_one_line(address: str) -
 )
 def test_what_can_be_no_host_and_no_radio_is_refused_in_words(address: str, words: str) -> None:
     with pytest.raises(LinkError) as error:
-        open_link(address)
+        open_link(address, pytest.fail)
     assert str(error.value) == f"link {address}: {words}"
 
 
@@ -163,8 +168,69 @@ def test_what_can_be_no_host_and_no_radio_is_refused_in_words(address: str, word
 )
 def test_a_port_or_rate_that_is_none_is_refused_with_what_would_be_right(address: str, right: str) -> None:
     with pytest.raises(LinkError, match=f"^link {re.escape(address)}: ") as error:
-        open_link(address)
+        open_link(address, pytest.fail)
     assert right in str(error.value) and "invalid literal" not in str(error.value)
+
+
+def test_port_that_another_process_has_is_refused() -> None:
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as other:
+        other.bind(("127.0.0.1", 0))
+        with pytest.raises(LinkError, match="cannot be opened: Address already in use"):
+            open_link(f"udpin:127.0.0.1:{other.getsockname()[1]}", pytest.fail)
+
+
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+def test_link_at_an_address_that_the_robot_does_not_have_yet_is_opened_when_it_has_it(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: a robot that was restarted before its network was up did not start."""
+
+    def bind(self: socket.socket, address: object) -> None:
+        raise OSError(errno.EADDRNOTAVAIL, "as long as the network is down")
+
+    address = f"{kind}:127.0.0.1:{free_port()}"
+    with monkeypatch.context() as down:
+        down.setattr(socket.socket, "bind", bind)
+        links = Links([address])
+        assert links.warnings == [f"link {address}: not there yet: Cannot assign requested address; it is opened when it is there"]
+        assert list(links.receive()) == [] and not links.channels
+    with closing(links), closing(socket.socket(type=socket.SOCK_DGRAM if kind == "udpin" else socket.SOCK_STREAM)) as client:
+        assert list(links.receive()) == []  # opens it
+        client.settimeout(PATIENCE_S)
+        client.connect(("127.0.0.1", int(address.rpartition(":")[2])))
+        client.sendall(b"hello")
+        (got,) = received(links, 1)
+        links.send(got.channel, b"answer")
+        links.flush()
+        assert client.recv(100) == b"answer"
+
+
+def test_station_whose_name_nobody_knows_yet_is_spoken_to_when_somebody_does_and_holds_up_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The resolver may take half a minute to say that the network is down: it is not asked in the thread that hears stops."""
+    asked, is_up, ours = [], threading.Event(), threading.current_thread()
+
+    def resolve(name: str) -> str:
+        asked.append(name)
+        if threading.current_thread() is ours:
+            raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
+        assert is_up.wait(PATIENCE_S)
+        return "127.0.0.1"
+
+    monkeypatch.setattr("firmware_py.ground.transport.socket.gethostbyname", resolve)
+    monkeypatch.setattr("firmware_py.ground.transport._RESOLVE_EVERY_S", 0.0)
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as station:
+        station.bind(("127.0.0.1", 0))
+        station.setblocking(False)
+        address = f"udpout:station.local:{station.getsockname()[1]}"
+        with closing(Links([address])) as links:
+            assert links.warnings == [f"link {address}: not there yet: Temporary failure in name resolution; it is opened when it is there"]
+            end, got = time.monotonic() + PATIENCE_S, b""
+            while not got and time.monotonic() < end:
+                links.send(None, b"telemetry")
+                links.flush()
+                assert list(links.receive()) == []
+                is_up.set()
+                with suppress(BlockingIOError):
+                    got = station.recv(100)
+    assert got == b"telemetry" and asked == ["station.local"] * 2
 
 
 def test_messages_for_others_are_passed_on_to_where_they_were_heard() -> None:

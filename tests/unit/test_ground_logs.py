@@ -39,7 +39,7 @@ def test_log_that_is_deleted_while_the_folder_is_listed_hides_no_other(tmp_path:
     client = world.client()
     client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
     world.run(5)
-    assert [entry.num_logs for entry in client.all("LOG_ENTRY")] == [2, 2]
+    assert [entry.id for entry in client.all("LOG_ENTRY")] == [0, 2]
 
 
 def test_each_of_two_clients_has_the_log_that_it_fetches(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_client_that_leaves_with_an_answer_to_come_leaves_nothing_behind(tmp_pat
     world.station.leave(client.channel)
     world.run(3)
     services = world.station.services[1]
-    assert not services.system.outbox._encoders and not services.logs._transfers
+    assert not services.system.outbox._encoders and not services.logs._transfers and not services.logs._files
 
 
 def test_flood_of_requests_for_the_list_of_logs_looks_at_the_folder_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -113,11 +113,9 @@ def test_log_that_is_being_fetched_comes_to_its_end_though_its_body_docks_meanwh
 @pytest.mark.parametrize(("identity", "first"), [("generic", 0), ("ardusub", 1)])
 def test_logs_are_listed_and_fetched(identity: str, first: int, tmp_path: Path) -> None:
     """QGroundControl finds no log whose number equals their count, unless the autopilot is ArduPilot. Regression: it missed the newest."""
-    (tmp_path / "flight1").mkdir()
     data = bytes(i % 251 for i in range(9_999))
-    (tmp_path / "flight1" / "signals.mcap").write_bytes(data)
-    os.utime(tmp_path / "flight1" / "signals.mcap", (1_000_000, 1_000_000))
-    (tmp_path / "can.log").write_bytes(b"frames")
+    (tmp_path / "can.log").write_bytes(data)
+    (tmp_path / "signals.mcap").write_bytes(b"frames")
     world = World(config=GroundConfig(logs=str(tmp_path), identity=identity))
     client = world.client()
     client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
@@ -138,13 +136,46 @@ def test_logs_are_listed_and_fetched(identity: str, first: int, tmp_path: Path) 
     assert "logs are not erased" in client.texts and (tmp_path / "can.log").exists()
 
 
-def test_logs_of_all_runs_are_listed_oldest_first(tmp_path: Path) -> None:
-    """The first run logs into the folder itself, later ones into numbered folders in it."""
-    for size, name in enumerate((".", "0002", "0003", "0010"), 1):
+def test_logs_of_all_runs_are_listed_oldest_first_whatever_their_times(tmp_path: Path) -> None:
+    """The first run logs into the folder itself, later ones into numbered folders in it. The clock may be set back."""
+    for size, name in enumerate((".", "0002", "0003", "0010", "9999", "10000"), 1):
         (tmp_path / name).mkdir(exist_ok=True)
         (tmp_path / name / "can.log").write_bytes(bytes(size))
-        os.utime(tmp_path / name / "can.log", (1_000_000 + size, 1_000_000 + size))
+        os.utime(tmp_path / name / "can.log", (1_000_000 - size, 1_000_000 - size))
     client = (world := World(config=GroundConfig(logs=str(tmp_path)))).client()
     client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
     world.run(1)
-    assert [(e.id, e.size) for e in client.all("LOG_ENTRY")] == [(0, 1), (1, 2), (2, 3), (3, 4)]
+    assert [(e.id, e.size) for e in client.all("LOG_ENTRY")] == [(k, k + 1) for k in range(6)]
+
+
+def test_flight_whose_disk_failed_is_listed_as_the_newest(tmp_path: Path) -> None:
+    """Its files are dated back to 1970, so that no later start believes them. Regression: of many flights it was the one left out."""
+    for run in range(1, 103):
+        folder = tmp_path / f"{run:04d}" if run > 1 else tmp_path
+        folder.mkdir(exist_ok=True)
+        (folder / "can.log").write_bytes(bytes(run))
+    os.utime(tmp_path / "0102" / "can.log", (0, 0))
+    client = (world := World(config=GroundConfig(logs=str(tmp_path)))).client()
+    client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(15)
+    assert [(e.id, e.size) for e in client.all("LOG_ENTRY")] == [(k, k + 3) for k in range(100)]
+
+
+def test_list_for_another_client_changes_no_number_under_which_a_log_is_fetched(tmp_path: Path) -> None:
+    """Regression: the rest of a log that was fetched in two requests was that of another file."""
+    (tmp_path / "0002").mkdir()
+    (tmp_path / "can.log").write_bytes(b"1" * 180)
+    (tmp_path / "0002" / "can.log").write_bytes(b"2" * 180)
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    fetching, listing = world.client(), world.client(200)
+    fetching.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(2)
+    fetching.send("LOG_REQUEST_DATA", 1, 1, 1, 0, 90)
+    world.run(2)
+    (tmp_path / "can.log").unlink()
+    listing.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    world.run(2)
+    fetching.send("LOG_REQUEST_DATA", 1, 1, 1, 90, 90)
+    world.run(2)
+    assert [entry.num_logs for entry in listing.all("LOG_ENTRY")] == [1]
+    assert b"".join(bytes(p.data[: p.count]) for p in fetching.all("LOG_DATA")) == b"2" * 180

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 import threading
 import time
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor, wait
@@ -74,6 +75,24 @@ def test_planning_process_ends_a_plan_that_its_body_does_not_wait_for_any_more(m
         wait([future for _, future in side._plans])
         side.pump()
     assert [(plan.serial, plan.reason) for plan in plans] == [(1, "nobody waits for it any more"), (2, "")]
+
+
+def blocked_here(job: PlanJob, body: object) -> set[signal.Signals]:
+    """Stands in for the planning of a mission: the signals that its process does not receive."""
+    return {signal.Signals(number) for number in signal.pthread_sigmask(signal.SIG_BLOCK, [])}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("at_the_start", [True, False])
+def test_planning_process_that_is_still_importing_hears_no_press_of_ctrl_c(at_the_start: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: Ctrl-C in the first seconds of a run printed the traceback of that process."""
+    monkeypatch.setattr("firmware_py.app.ground_station._plan_mission", blocked_here)
+    with closing(side_on(f"udpin:127.0.0.1:{free_port()}")) as side:
+        side._executor = None
+        if at_the_start:
+            side._start_planner()
+        blocked = side._begin(_WARM_UP_JOB, None).result()
+    assert blocked == {signal.SIGINT} and signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
 def test_robot_that_is_stopped_waits_for_no_plan_that_is_being_made() -> None:

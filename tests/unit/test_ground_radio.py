@@ -1,5 +1,6 @@
 """A radio on a serial line that is slow, accepts nothing for a while, and is unplugged and plugged in again."""
 
+import errno
 import math
 import os
 import pty
@@ -13,12 +14,15 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import serial
 from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.core.types import Action, Event
+from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.link import Links
 from firmware_py.ground.signing import Signing
 from firmware_py.ground.telemetry import DEFAULT_HZ
+from firmware_py.ground.transport import LinkError
 from firmware_py.ground.wire import checksum
 from tests.unit.ground_attack import KEY, NOW
 from tests.unit.ground_sides import PATIENCE_S, free_port, heartbeat, pump, received, side_on
@@ -109,8 +113,8 @@ def test_torn_frame_of_a_link_that_is_gone_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize("trusted", [False, True])
-def test_key_behind_a_torn_frame_is_taken_from_a_trusted_link_alone(trusted: bool) -> None:
-    world = World()
+def test_key_behind_a_torn_frame_is_taken_from_a_trusted_link_alone(trusted: bool, tmp_path: Path) -> None:
+    world = World(config=GroundConfig(store=str(tmp_path)))
     client = world.client()
     setup = client.pack("SETUP_SIGNING", 1, 1, list(KEY), NOW)
     world.station.take(client.channel, TORN + setup, world.time_ns, datagram=False, trusted=trusted)
@@ -175,7 +179,7 @@ class SlowLink:
 
 def test_radio_slower_than_what_streams_gets_less_of_everything_and_every_heartbeat_and_text(monkeypatch: pytest.MonkeyPatch) -> None:
     radio, robot = SlowLink(57.6), Robot(modules=4)  # 57,600 Bd at 100 Hz
-    monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address: radio)
+    monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address, warn: radio)
     with closing(side_on("radio", modules=4)) as side:
         for second in range(20):
             pump(side, robot, 99)
@@ -199,7 +203,7 @@ def test_what_a_companion_computer_streams_to_all_leaves_a_radio_its_telemetry_a
     """Regression: a hundred estimates a second filled the radio's queue; the station got one message of each kind, and answers 4 s late."""
     radio, cable, robot = SlowLink(57.6), SlowLink(math.inf), Robot()
     links = iter((radio, cable))
-    monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address: next(links))
+    monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address, warn: next(links))
     companion = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
     estimate = bytes(mavlink.MAVLink_vision_position_estimate_message(0, 1, 2, 3, 0.1, 0.2, 0.3, [0.1] * 21).pack(companion))
     seldom = (mavlink.MAVLink_param_value_message(b"EXPOSURE", 1.0, 9, 1, 0), mavlink.MAVLink_message_interval_message(30, 100_000))
@@ -273,6 +277,33 @@ def test_radio_that_is_pulled_and_plugged_in_again_is_taken_up_again(tmp_path: P
         links.flush()
         assert os.read(radio.ours, 100) == b"answer"
     radio.pull()
+
+
+def test_radio_that_is_not_plugged_in_yet_is_warned_of_and_taken_up_when_it_is(tmp_path: Path) -> None:
+    """Regression: a robot that was restarted after its radio had come loose did not start."""
+    name = tmp_path / "radio"
+    with closing(Links([f"{name},115200"])) as links:
+        assert links.warnings == [f"link {name},115200: not there yet: No such file or directory; it is opened when it is there"]
+        links.send(None, b"to nobody")
+        links.flush()
+        assert list(links.receive()) == []
+        radio = Radio(name)
+        assert list(links.receive()) == []  # opens it
+        os.write(radio.ours, heartbeat())
+        assert b"".join(r.data for r in received(links, 1)) == heartbeat()
+        links.send(None, b"answer")
+        links.flush()
+        assert os.read(radio.ours, 100) == b"answer"
+    radio.pull()
+
+
+def test_radio_that_nobody_may_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*arguments: object, **more: object) -> None:
+        raise serial.SerialException(errno.EACCES, "could not open port")
+
+    monkeypatch.setattr(serial, "Serial", refuse)
+    with pytest.raises(LinkError, match="cannot be opened: Permission denied"):
+        Links([f"{tmp_path / 'radio'},115200"])
 
 
 def test_radio_that_is_pulled_while_it_is_taken_up_again_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

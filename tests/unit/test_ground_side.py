@@ -216,3 +216,12 @@ def test_ground_side_in_which_something_fails_says_so_once_and_goes_on_to_hear_a
             asked = [request.action for request in side.requests()]
     assert Action.ESTOP in asked and side.error is not None
     assert type(side.error).__name__ in said.get_nowait() and said.empty()
+
+
+def test_link_that_is_not_there_yet_is_said_and_keeps_no_other_from_its_work(tmp_path: Path) -> None:
+    said: Queue[str] = Queue()
+    config = GroundConfig(links=(f"{tmp_path}/radio,57600", "udpin:127.0.0.1:0"))
+    with GroundSide(config, firmware_of(), ThreadPoolExecutor(1), say=said.put) as side:
+        warning = said.get(timeout=PATIENCE_S)
+        assert side.error is None
+    assert warning == f"warning: link {tmp_path}/radio,57600: not there yet: No such file or directory; it is opened when it is there"

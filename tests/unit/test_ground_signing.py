@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from firmware_py.core.types import Action
+from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.files import write_atomically
 from firmware_py.ground.signing import FILE_MODE, Signing, load_signing, units_of
 from tests.unit.ground_world import Client, World
@@ -107,12 +108,13 @@ def setup(client: Client, key: bytes = KEY) -> None:
     client.send("SETUP_SIGNING", 1, 1, list(key), NOW)
 
 
-def test_key_is_taken_only_disarmed_and_on_a_trusted_link() -> None:
-    world = World()
+def test_key_is_taken_only_disarmed_and_on_a_trusted_link(tmp_path: Path) -> None:
+    config = GroundConfig(store=str(tmp_path))
+    world = World(config=config)
     client = world.client()
     setup(client)
     assert world.station.signing.key is None
-    world = World(trusted=True)
+    world = World(config=config, trusted=True)
     client = world.client()
     client.command(400, 1)
     world.run(3)
@@ -125,10 +127,22 @@ def test_key_is_taken_only_disarmed_and_on_a_trusted_link() -> None:
     assert "signing refused" in client.texts
 
 
-def test_a_new_key_must_come_under_the_old_one_and_zeros_end_signing() -> None:
+def test_key_that_nothing_would_keep_is_refused_and_signing_may_still_be_ended() -> None:
+    """Regression: a robot without a store took the key, and after a restart believed unsigned frames again."""
+    world = World(trusted=True)
+    client = world.client()
+    setup(client)
+    world.run(1)
+    assert world.station.signing.key is None and client.texts == "signing refused: no --store to keep the key in"
+    world.station.signing.adopt(KEY, NOW)
+    setup(with_key(client), bytes(32))
+    assert world.station.signing.key is None
+
+
+def test_a_new_key_must_come_under_the_old_one_and_zeros_end_signing(tmp_path: Path) -> None:
     signing = Signing(key=KEY)
     signing.advance(NOW_NS)
-    world = World(signing=signing, trusted=True)
+    world = World(config=GroundConfig(store=str(tmp_path)), signing=signing, trusted=True)
     client = world.client()
     setup(client, bytes(range(2, 34)))
     assert world.station.signing.key == KEY
@@ -189,10 +203,10 @@ def test_the_last_time_stamp_is_the_last_one() -> None:
 
 
 @pytest.mark.parametrize(("stamp", "is_taken"), [(NOW + MINUTE, True), (NOW + MINUTE + 1, False), (LAST, False), (2**64 - 1, False)])
-def test_key_from_more_than_a_minute_ahead_is_refused(stamp: int, is_taken: bool) -> None:
+def test_key_from_more_than_a_minute_ahead_is_refused(stamp: int, is_taken: bool, tmp_path: Path) -> None:
     signing = Signing()
     signing.advance(NOW_NS)
-    world = World(trusted=True, signing=signing)
+    world = World(config=GroundConfig(store=str(tmp_path)), trusted=True, signing=signing)
     client = world.client()
     client.send("SETUP_SIGNING", 1, 1, list(KEY), stamp)
     world.run(1)

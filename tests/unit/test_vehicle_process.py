@@ -44,6 +44,23 @@ def test_second_signal_does_not_end_the_process_before_its_log_is_closed(tmp_pat
     assert not fatal
 
 
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_vehicle_that_is_stopped_while_it_starts_ends_without_a_tick_or_a_log(
+    number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: SIGTERM left the folder of a log in which nothing was."""
+
+    def die(number: int, frame: object) -> None:
+        raise AssertionError(f"signal {number} ends the process here")
+
+    said: list[str] = []
+    monkeypatch.setattr(vehicle, "read_libraries", lambda: os.kill(os.getpid(), number))
+    with handled(die):
+        summary = run_vehicle(single(bus=bus_of(tmp_path)), Parameters(), out=tmp_path / "log", say=said.append)
+    assert summary.ticks == 0 and not any(line.startswith("running at") for line in said)
+    assert list((tmp_path / "log").iterdir()) == []
+
+
 def test_vehicle_whose_terminal_is_gone_ends_as_it_does_by_a_signal(tmp_path: Path) -> None:
     fatal: list[int] = []
 
