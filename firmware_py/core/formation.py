@@ -29,7 +29,7 @@ class Formation:
         self.parameters = parameters
         """The present parameters; bodies still in preparation get them when they begin."""
         self._broken: list[tuple[int, Body]] = []
-        """Bodies that came apart by themselves in the last BROKEN_NS, and when."""
+        """Bodies that came apart by themselves, and when; those older than BROKEN_NS are forgotten at the next one."""
         self._watch_joints()
 
     @property
@@ -39,8 +39,7 @@ class Formation:
 
     def bodies_known(self, time_ns: int) -> list[Body]:
         """The bodies, and those that came apart by themselves so recently that a person may still mean the whole."""
-        self._broken = [(at_ns, body) for at_ns, body in self._broken if time_ns - at_ns <= BROKEN_NS]
-        return [*self.bodies, *(body for _, body in self._broken)]
+        return [*self.bodies, *(body for at_ns, body in self._broken if time_ns - at_ns <= BROKEN_NS)]
 
     def retune(self, parameters: Parameters) -> None:
         """Changes the parameters from this tick on."""
@@ -142,7 +141,8 @@ class Formation:
     def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:
         after = [parted.stays, parted.leaves]
         before = self._chains_of(parted.whole)
-        self._broken += [(time_ns, whole.body) for whole in before if whole.parting]
+        recent = [(at_ns, body) for at_ns, body in self._broken if time_ns - at_ns <= BROKEN_NS]
+        self._broken = recent + [(time_ns, whole.body) for whole in before if whole.parting]
         found = [self._begin(pipeline, before, time_ns) for pipeline in after]
         parted.leaves.guidance.move_by(parted.away_w)
         self._swap(before, after, estimates, found)
