@@ -225,13 +225,13 @@ class GroundSide:
         self.close()
 
     def close(self) -> None:
-        """Close the links, store what is left, and end the planning process."""
+        """Close the links, end the planning process, and store what is left."""
         self.links.close()
-        self._writer.close()
         if isinstance(self._executor, ProcessPoolExecutor):
             for process in list(self._executor._processes.values()):  # Python 3.14: kill_workers()
                 process.kill()  # no plan is wanted any more, and one that still loads its code would be waited for
             self._executor.shutdown(wait=True, cancel_futures=True)
+        self._writer.close()
 
     def _run(self, teller: Teller) -> None:
         for warning in self.links.warnings:

@@ -58,7 +58,7 @@ class DockingStage:
         """By body: its newest dock or undock that waits for its plan."""
         self._joints = JointWatch(parameters)
         self._closed: list[frozenset[int]] = []
-        """Modules of each joint that docks have closed since joints were last given to watch."""
+        """Modules of each joint that a dock closes in this tick."""
         self.events: list[Event] = []
         self.records: list[DockRecord] = []
 
@@ -70,7 +70,6 @@ class DockingStage:
     def watch_joints(self, joints: Sequence[Joint]) -> None:
         """Watches `joints`, all joints of the fleet, and lets their magnets pull, except for joints that are being undocked."""
         self._joints.watch(joints, self._closed)
-        self._closed = []
         parting = self._parting
         self.relays.switch(RELAY_PULL, *(joint.request for joint in joints if modules_of(joint.request) not in parting))
 
@@ -149,7 +148,7 @@ class DockingStage:
             coming: bodies that are on their way to meet another.
             resting: modules and faces whose magnets are forced off.
         """
-        self.events, self.records = [], []
+        self.events, self.records, self._closed = [], [], []
         decisions = Decisions()
         poses = ModulePoses(inputs.modules, self._tags)
         for prepared in inputs.prepared:

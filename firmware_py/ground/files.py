@@ -10,8 +10,8 @@ from queue import SimpleQueue
 
 RETRY_S = 1.0
 """Delay before a failed write is tried again."""
-CLOSE_S = 5.0
-"""How long the end of a run waits for a disk."""
+CLOSE_S = 1.0
+"""How long the end of a run waits for a disk: the log and the e-stop note are closed after it, within the service's five seconds."""
 
 
 def write_atomically(path: Path, data: bytes, mode: int = 0o644) -> None:

@@ -117,8 +117,8 @@ class MissionFlight:
         return self._system.subject.progress.state == ACTIVE
 
     def start(self, first: int | None) -> str:
-        """Starts the mission at item `first`; with None resumes it where it stopped. One already started there flies on: the answer to the
-        first request may have been lost.
+        """Starts the mission at item `first`; with None resumes it where it stopped. One already started there flies on, unless it is late:
+        the answer to the first request may have been lost.
 
         Returns why not, or an empty text.
         """
@@ -128,8 +128,8 @@ class MissionFlight:
             return "there is none"
         if not s.armed:
             return "the vehicle is disarmed"
-        if self._flight is not None and self._system.task_changes != self._flight.task_changes:
-            self._end(PAUSED)  # an earlier request gave the body another task, and the next tick would end the flight
+        if self._flight is not None and (self._flight.is_late or self._system.task_changes != self._flight.task_changes):
+            self._end(PAUSED)  # the body does not get to its place; or has another task, and the next tick would end the flight
         wanted = first
         if wanted is None:
             wanted = s.progress.current if s.progress.state == PAUSED else 0

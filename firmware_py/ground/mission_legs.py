@@ -61,6 +61,11 @@ class Flight:
         """Whether the flight belongs to a mission, rather than going to a single place."""
         return self.legs[0].sequence != GO_TO
 
+    @property
+    def is_late(self) -> bool:
+        """Whether the next leg counts as late."""
+        return math.isinf(self.late_s)
+
     def reach(self, t_s: float) -> None:
         """Counts the next leg as reached at `t_s` from the start."""
         self.reached_s, self.late_s = t_s, t_s - self.arrivals_s[self.reached]

@@ -211,9 +211,13 @@ class LateLink:
                 self._host = socket.gethostbyname(name)
 
     def receive(self) -> list[tuple[Any, bytes]]:
+        """Raises OSError for an address that cannot be opened although its network is there, as one in use."""
         if self._link is None and self._host:
-            with contextlib.suppress(OSError):  # its network is still down
+            try:
                 self._link = _open_network(self._kind, self._host, self._port)
+            except OSError as error:
+                if error.errno != errno.EADDRNOTAVAIL:
+                    raise
         return self._link.receive() if self._link is not None else []
 
     def send(self, peer: Any, frame: bytes) -> bool:
@@ -251,6 +255,8 @@ class SerialLink:
             self._serial = serial.Serial(self._device, self._baud, timeout=0, write_timeout=0)
         except termios.error as error:  # unplugged meanwhile: not an OSError, and pyserial lets it through
             raise OSError(*error.args) from None
+        except ValueError as error:  # a rate that the driver refuses
+            raise OSError(str(error)) from None
         except serial.SerialException as error:
             if isinstance(error.__context__, termios.error):  # SerialException keeps neither its errno nor its text separately
                 raise OSError(*error.__context__.args) from None

@@ -246,6 +246,24 @@ def test_joint_that_a_dock_has_closed_keeps_the_hysteresis_of_the_dock(current_m
 
 
 @pytest.mark.slow
+def test_joints_of_two_docks_that_close_in_one_tick_both_keep_the_hysteresis() -> None:
+    tank = FaultyTank([(0, 0, 0), (0, 1, 0)] * 2, Parameters().replace("docking.push_m", 0.0), apart=True)
+    for k, state in enumerate(tank.states):
+        state[:7] = [1.0 + k // 2, k % 2 * PITCH_M, 0.8, *from_euler(0.0, 0.02, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, *(Request(Action.ARM, m) for m in range(4)))
+    tank.run(0.03, *(Request(Action.DOCK, m, DockRequest(m, 3, m - 1, 2)) for m in (1, 3)))
+    for dock in tank.pipeline.formation.docking._docks:
+        dock.sequence.stage, dock.sequence._gap_m = Stage.VERIFY, 0.0  # as if it had just arrived
+    while len(tank.shape) == 4:
+        tank.run(0.01)
+    assert tank.shape == [(0, 1), (2, 3)]
+    tank.pull_ma = 60.0
+    tank.run(2.0)
+    assert not any("a docked partner is lost" in words for _, words in tank.event_log)
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("armed", [0, 1])
 def test_robot_that_docks_to_one_that_is_disarmed_is_disarmed_and_says_so(armed: int) -> None:
     tank = FaultyTank([(0, 0, 0), (0, 1, 0)], Parameters().replace("docking.push_m", 0.0), apart=True)

@@ -203,6 +203,20 @@ def test_link_at_an_address_that_the_robot_does_not_have_yet_is_opened_when_it_h
         assert client.recv(100) == b"answer"
 
 
+def test_late_link_whose_port_is_taken_meanwhile_is_counted_as_failing(monkeypatch: pytest.MonkeyPatch) -> None:
+    def bind(self: socket.socket, address: object) -> None:
+        raise OSError(errno.EADDRNOTAVAIL, "as long as the network is down")
+
+    with closing(socket.socket(type=socket.SOCK_DGRAM)) as other:
+        other.bind(("127.0.0.1", 0))
+        with monkeypatch.context() as down:
+            down.setattr(socket.socket, "bind", bind)
+            links = Links([f"udpin:127.0.0.1:{other.getsockname()[1]}"])
+            assert list(links.receive()) == [] and not links.counts
+        with closing(links):
+            assert list(links.receive()) == [] and links.counts == {"receive": 1}
+
+
 def test_station_whose_name_nobody_knows_yet_is_spoken_to_when_somebody_does_and_holds_up_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The resolver may take half a minute to say that the network is down: it is not asked in the thread that hears stops."""
     asked, is_up, ours = [], threading.Event(), threading.current_thread()

@@ -37,6 +37,23 @@ def test_body_that_is_held_back_reaches_nothing_until_it_is_there(world: World, 
     assert continued(world, client) == [0, 1, 2]
 
 
+@pytest.mark.parametrize(("command", "planned"), [((300, 0, 0), [0, 1, 2]), ((176, 1, 4, 4), [1, 2]), ((193, 1), [1, 2])])
+def test_mission_whose_body_does_not_get_to_an_item_is_planned_anew_when_it_is_started_again(
+    command: tuple[float, ...], planned: list[int], world: World, client: Client
+) -> None:
+    """By MISSION_START from item 0, by the mode, and by "continue". Regression: the start was accepted, and nothing happened."""
+    start(world, client, *(item(i, place) for i, place in enumerate(PLACES)))
+    world.run(1100)
+    assert client.last("MISSION_ITEM_REACHED").seq == 0
+    world.robot.off_plan = HELD_BACK
+    world.run(2600)
+    assert "mission item 1 is late" in client.texts
+    client.command(*command)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.sequence for leg in job.legs] == planned
+
+
 def test_body_that_comes_late_completes_its_mission_when_it_is_there(world: World, client: Client) -> None:
     world.robot.off_plan = HELD_BACK
     start(world, client, item(0, PLACES[0]))

@@ -297,6 +297,20 @@ def test_radio_that_is_not_plugged_in_yet_is_warned_of_and_taken_up_when_it_is(t
     radio.pull()
 
 
+def test_radio_that_refuses_its_rate_once_it_is_there_makes_no_other_link_deaf(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """pyserial raises ValueError, which is no OSError."""
+    def refuse(*_: object, **__: object) -> None:
+        raise ValueError("Failed to set custom baud rate (250001): [Errno 22] Invalid argument")
+
+    name = tmp_path / "radio"
+    with closing(Links([f"{name},250001"])) as links:
+        name.write_text("")
+        monkeypatch.setattr("firmware_py.ground.transport.serial.Serial", refuse)
+        assert list(links.receive()) == []
+        with pytest.raises(LinkError, match="cannot be opened: Failed to set custom baud rate"):
+            Links([f"{name},250001"])
+
+
 def test_radio_that_nobody_may_use_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*arguments: object, **more: object) -> None:
         raise serial.SerialException(errno.EACCES, "could not open port")
