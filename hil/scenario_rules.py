@@ -131,18 +131,22 @@ def _in_tank(scenario: Scenario) -> Iterator[Mistake]:
         if not scenario.tank.holds(place):
             where = f"{place.tolist()} m is outside the tank, a {scenario.tank}"
             yield (table, i, "position_m"), f"{where} with its surface's centre at [0, 0, 0]"
-    vehicles = _vehicles(scenario)
-    for i, step in enumerate(scenario.step):
-        if step.do == "move" and step.module in vehicles:
-            where = sphere_in_wall(scenario.tank, step.position_m, inscribed_radius_m(vehicles[step.module]))
-            if where:
-                yield ("step", i, "position_m"), f"there the hull of module {step.module} is {where}, however it is turned; {MOVE_IN}"
     for i, where in hulls_in_walls(scenario, np.zeros((1, 3)), np.zeros(1)):
         leader = next(members[0] for members in scenario.groups if i in members)
         module = scenario.module[i]
         advice = remedy(scenario.tank, load_vehicle(module.vehicle), module.start)
         what = f"the hull of module {module.number} is {where}; {advice}{' by that' if advice == MOVE_IN else ''}"
         yield ("module", leader, "position_m"), what
+
+
+def _in_moves(scenario: Scenario) -> Iterator[Mistake]:
+    """Checks the target positions of moves for the largest sphere in the module's hull: nobody knows yet how it will be turned."""
+    vehicles = _vehicles(scenario)
+    for i, step in enumerate(scenario.step):
+        if step.do != "move" or step.module not in vehicles:
+            continue
+        if where := sphere_in_wall(scenario.tank, step.position_m, inscribed_radius_m(vehicles[step.module])):
+            yield ("step", i, "position_m"), f"there the hull of module {step.module} is {where}, however it is turned; {MOVE_IN}"
 
 
 def _in_start(scenario: Scenario) -> Iterator[Mistake]:
@@ -239,7 +243,7 @@ def _out_of_reach(check: Check) -> Iterator[tuple[str, str]]:
 
 
 RULES = (
-    _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_tank, _in_start, _in_mentions,
+    _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_tank, _in_moves, _in_start, _in_mentions,
     _in_faces, _in_tags, _in_faults, _in_checks,
 )  # fmt: skip
 """In order of priority: the first mistake found is the one reported."""

@@ -78,7 +78,7 @@ def inscribed_radius_m(vehicle: Vehicle) -> float:
 
 
 def sphere_in_wall(tank: Tank, centre_m: np.ndarray, radius_m: float) -> str:
-    """Describes which wall a sphere penetrates deepest, as `in_wall` does."""
+    """Describes which wall a sphere about `centre_m` (3,), world, penetrates deepest, as `in_wall` does."""
     x, y, _ = centre_m.tolist()
     outward = np.array([x, y, 0.0]) / max(math.hypot(x, y), TOUCHING_M)
     return in_wall(tank, centre_m + radius_m * np.array([*np.eye(3), *-np.eye(3), outward]))

@@ -8,26 +8,22 @@ from __future__ import annotations
 
 import fcntl
 import os
-import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from queue import Empty, SimpleQueue
 
 from firmware_py.app.firmware import BusFrame
 from firmware_py.app.observers import Observer
 from firmware_py.core.transitions import State
 from firmware_py.core.types import WARNING, Action, Event, Inputs, Outputs
 from firmware_py.description.schema import DescriptionError
-from firmware_py.ground.files import write_atomically
+from firmware_py.ground.files import FileWriter, write_atomically
 from firmware_py.runtime.recorder import Recorder
 
 NOTE = "estop.txt"
 STANDS, CLEAR = b"stands\n", b"clear \n"
 CLOSE_S = 5.0
 """How long the end of a run waits for a disk."""
-RETRY_S = 1.0
-"""Delay before a failed write of the note is retried."""
 
 
 def estop_stands(folder: Path) -> bool:
@@ -95,45 +91,28 @@ class EstopNote:
             self._handle = lock_folder(folder)
             if self._handle is None:
                 raise DescriptionError(f"another vehicle that runs logs into {folder}: end it first, or give this one another --out")
-        self._queue: SimpleQueue[bool | None] = SimpleQueue()
-        self._failed: SimpleQueue[OSError] = SimpleQueue()
-        self._thread = threading.Thread(target=self._run, name="e-stop note", daemon=True)
-        self._thread.start()
+        self._writer = FileWriter(CLOSE_S, self._keep)
 
     def write(self, stands: bool) -> None:
         """Queues a write. A failed write is retried until it succeeds or a newer one replaces it."""
-        self._queue.put(stands)
+        self._writer.write(self._folder / NOTE, STANDS if stands else CLEAR)
 
     def failures(self) -> list[Event]:
-        """A warning for one failed write that was not reported yet, if there is any."""
-        if self._failed.empty():
-            return []
-        return [Event(WARNING, f"the next start will not know of an e-stop: {NOTE}: {self._failed.get().strerror}")]
+        """A warning that writes fail, if that was not reported yet."""
+        failures = self._writer.failures()
+        return [Event(WARNING, f"the next start will not know of an e-stop: {path.name}: {error.strerror}") for path, error in failures]
 
     def close(self) -> None:
         """Writes what is queued, waiting at most CLOSE_S, and releases the folder; a second call does nothing."""
-        self._queue.put(None)
-        self._thread.join(CLOSE_S)
+        self._writer.close()
         if self._handle is not None:
             os.close(self._handle)
             self._handle = None
 
-    def _run(self) -> None:
-        waiting: bool | None = None
-        ended = False
-        while not ended:
-            fresh = False
-            with suppress(Empty):
-                told = self._queue.get(timeout=None if waiting is None else RETRY_S)
-                fresh, ended = told is not None, told is None
-                waiting = waiting if ended else told
-            try:
-                if waiting is not None:
-                    write_note(self._folder, waiting)
-                waiting = None
-            except OSError as error:
-                if fresh:
-                    self._failed.put(error)
+    def _keep(self, path: Path, data: bytes, mode: int) -> None:
+        try:
+            write_note(path.parent, data == STANDS)
+        finally:
             if self._handle is None:  # the folder did not exist before
                 with suppress(OSError):
                     self._handle = lock_folder(self._folder)

@@ -55,6 +55,8 @@ _MOST_REQUESTS = 256
 """Longest queue of requests for a tick."""
 _SAVE_EVERY_NS = 1_000_000_000
 """Interval between saves of the signing time stamp; the saved stamp is ahead by as much. A new key is saved at once."""
+_CLOSE_S = 1.0
+"""How long the end of a run waits for the store's disk: log and e-stop note are closed after it, within the service's five seconds."""
 
 
 _WARM_UP_JOB = PlanJob(0, 0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (), 0.1, 1.0)
@@ -135,7 +137,7 @@ class GroundSide:
         self._stopping = False
         self._saved_ns = 0
         self._saved_key = self.station.signing.key
-        self._writer = FileWriter()
+        self._writer = FileWriter(_CLOSE_S)
         self._switch_s = 0.0
         self.keeper: RateKeeper | None = None
         """Rate keeper of a real-time loop, from which telemetry reports how ticks keep their deadlines."""

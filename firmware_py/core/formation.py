@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from firmware_py.core.pipeline import BodyPipeline
 
 BROKEN_NS = 5_000_000_000
-"""How long a DISARM of a body that came apart by itself stops all its pieces: a person who sees it break means the whole."""
+"""How long a DISARM of a body that came apart by itself stops all its pieces: a person who sees it break means the whole, and takes a few
+seconds (synthetic) to see it and to act."""
 
 
 class Formation:
@@ -39,7 +40,10 @@ class Formation:
 
     def bodies_known(self, time_ns: int) -> list[Body]:
         """The bodies, and those that came apart by themselves so recently that a person may still mean the whole."""
-        return [*self.bodies, *(body for at_ns, body in self._broken if time_ns - at_ns <= BROKEN_NS)]
+        return [*self.bodies, *(body for _, body in self._broken_lately(time_ns))]
+
+    def _broken_lately(self, time_ns: int) -> list[tuple[int, Body]]:
+        return [broken for broken in self._broken if time_ns - broken[0] <= BROKEN_NS]
 
     def retune(self, parameters: Parameters) -> None:
         """Changes the parameters from this tick on."""
@@ -141,8 +145,7 @@ class Formation:
     def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:
         after = [parted.stays, parted.leaves]
         before = self._chains_of(parted.whole)
-        recent = [(at_ns, body) for at_ns, body in self._broken if time_ns - at_ns <= BROKEN_NS]
-        self._broken = recent + [(time_ns, whole.body) for whole in before if whole.parting]
+        self._broken = self._broken_lately(time_ns) + [(time_ns, whole.body) for whole in before if whole.parting]
         found = [self._begin(pipeline, before, time_ns) for pipeline in after]
         parted.leaves.guidance.move_by(parted.away_w)
         self._swap(before, after, estimates, found)

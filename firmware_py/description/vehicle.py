@@ -31,8 +31,9 @@ from firmware_py.description.schema import (
 _Module = TypeVar("_Module", bound=Any)
 
 FACE_NAMES = ("+x", "-x", "+y", "-y", "+z", "-z")
-FACE_KINDS = {"P": "a probe", "D": "a drogue", "-": "no docking face"}
 """Faces A..F of the bus, in order; the index is also the id of a tag on that face."""
+FACE_KINDS = {"P": "a probe", "D": "a drogue", "-": "no docking face"}
+"""Letters of `Vehicle.faces`, in words."""
 
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 """Degrees of freedom, in the order of a wrench and of every array of six here."""

@@ -16,8 +16,6 @@ _ENTRIES_AT_ONCE = 10
 """Entries of a list sent per round: half as many frames as pieces, since each requires a look at its file."""
 _MOST_LOGS = 100
 _SUFFIXES = (".mcap", ".log")
-_FIRST_RUN, _RUN_DIGITS = 1, 4
-"""The first run logs into the folder itself, each later one into a folder in it that is named by its number, of so many digits at least."""
 
 
 @dataclass(slots=True)
@@ -148,8 +146,10 @@ class LogService:
         return sorted(found, key=self._place)[-_MOST_LOGS:]
 
     def _place(self, path: Path) -> tuple[int, tuple[str, ...]]:
-        """Orders logs by run, then by name; not by time: both logs of this run are still written, and those of a failed disk dated back."""
+        """Orders logs by run, then by name; not by time: both logs of this run are still written, and those of a failed disk dated back.
+
+        The first run logs into the folder itself, each later one into a folder in it that is named by its number.
+        """
         assert self._folder is not None
         parts = path.relative_to(self._folder).parts
-        is_run = len(parts) > 1 and len(parts[0]) >= _RUN_DIGITS and parts[0].isdecimal()
-        return int(parts[0]) if is_run else _FIRST_RUN, parts
+        return int(parts[0]) if len(parts) > 1 and parts[0].isdecimal() else 0, parts

@@ -14,6 +14,7 @@ from firmware_py.app.estop_note import CLEAR, NOTE, STANDS, EstopNote, clear, es
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Event, Inputs, Outputs
 from firmware_py.description.schema import DescriptionError
+from firmware_py.ground import files
 from firmware_py.runtime.guarded_file import GuardedFile
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
 from tests.unit.ground_world import Robot
@@ -53,7 +54,7 @@ def test_stop_and_what_led_to_it_are_on_the_disk_for_who_pulls_the_plug_next(
 
     def sync(number: int) -> None:
         path = Path(os.readlink(f"/proc/self/fd/{number}"))
-        on_disk[path.name] = path.read_bytes() if path.is_file() else b""
+        on_disk[path.name.removesuffix(".new")] = path.read_bytes() if path.is_file() else b""  # .new: replaces the file whole
 
     monkeypatch.setattr(os, "fsync", sync)
     recorder = Recorder(tmp_path, {}, queued=queued)
@@ -102,7 +103,7 @@ def test_note_that_cannot_be_made_is_said_once_and_the_flight_goes_on(tmp_path: 
 
 
 def test_stop_that_a_full_disk_did_not_take_is_noted_as_soon_as_there_is_room(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(estop_note, "RETRY_S", 0.01)
+    monkeypatch.setattr(files, "RETRY_S", 0.01)
     tried, room, made = threading.Event(), threading.Event(), threading.Event()
     make = estop_note.write_atomically
 
@@ -208,7 +209,7 @@ def test_folder_is_one_vehicle_s_while_that_runs(tmp_path: Path, is_there: bool,
         EstopNote(folder)
     for _ in range(2):
         first.close()  # a second time does nothing
-    assert not first._thread.is_alive()
+    assert not first._writer._thread.is_alive()
     assert clear(folder) and not estop_stands(folder)
     EstopNote(folder).close()
 

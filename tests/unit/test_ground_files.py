@@ -35,7 +35,7 @@ def test_refused_write_leaves_the_file_as_it_was_and_nothing_beside_it(call: str
     assert path.read_bytes() == b"before" and os.listdir(tmp_path) == ["kept.txt"]
 
 
-def test_writer_leaves_out_contents_that_newer_ones_have_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writer_leaves_out_contents_that_newer_ones_have_replaced(tmp_path: Path) -> None:
     disk, busy, written = threading.Event(), threading.Event(), list[bytes]()
 
     def write(path: Path, data: bytes, mode: int) -> None:
@@ -44,8 +44,7 @@ def test_writer_leaves_out_contents_that_newer_ones_have_replaced(tmp_path: Path
         written.append(data)
         write_atomically(path, data, mode)
 
-    monkeypatch.setattr(files, "write_atomically", write)
-    with closing(FileWriter()) as writer:
+    with closing(FileWriter(60.0, write)) as writer:
         writer.write(tmp_path / "kept.txt", b"0")
         assert busy.wait(60.0)
         for data in (b"1", b"2", b"3"):
@@ -65,9 +64,8 @@ def test_writer_tries_again_until_the_disk_has_room_and_tells_of_it_once(tmp_pat
         write_atomically(path, data, mode)
         done.set()
 
-    monkeypatch.setattr(files, "write_atomically", write)
     monkeypatch.setattr(files, "RETRY_S", 0.0)
-    with closing(FileWriter()) as writer:
+    with closing(FileWriter(60.0, write)) as writer:
         writer.write(tmp_path / "kept.txt", b"new")
         assert done.wait(60.0)
     assert writer.failures() == [(tmp_path / "kept.txt", NO_ROOM)] and writer.failures() == []
@@ -75,7 +73,7 @@ def test_writer_tries_again_until_the_disk_has_room_and_tells_of_it_once(tmp_pat
 
 
 def test_writer_writes_what_is_left_at_its_end(tmp_path: Path) -> None:
-    writer = FileWriter()
+    writer = FileWriter(60.0)
     for name in "abc":
         writer.write(tmp_path / name, name.encode())
     writer.close()

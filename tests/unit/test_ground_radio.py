@@ -259,6 +259,16 @@ class Radio:
         os.close(self._theirs)
 
 
+def _talks(links: Links, radio: Radio) -> None:
+    """Asserts that the link is opened at the next look, and then carries bytes both ways."""
+    assert list(links.receive()) == []  # opens it
+    os.write(radio.ours, heartbeat())
+    assert b"".join(r.data for r in received(links, 1)) == heartbeat()
+    links.send(None, b"answer")
+    links.flush()
+    assert os.read(radio.ours, 100) == b"answer"
+
+
 def test_radio_that_is_pulled_and_plugged_in_again_is_taken_up_again(tmp_path: Path) -> None:
     name = tmp_path / "radio"
     radio = Radio(name)
@@ -270,12 +280,7 @@ def test_radio_that_is_pulled_and_plugged_in_again_is_taken_up_again(tmp_path: P
             assert list(links.receive()) == []
         assert links.counts["send"] + links.counts["receive"] == 1
         radio = Radio(name)
-        assert list(links.receive()) == []  # reopens it
-        os.write(radio.ours, heartbeat())
-        assert b"".join(r.data for r in received(links, 1)) == heartbeat()
-        links.send(None, b"answer")
-        links.flush()
-        assert os.read(radio.ours, 100) == b"answer"
+        _talks(links, radio)
     radio.pull()
 
 
@@ -288,12 +293,7 @@ def test_radio_that_is_not_plugged_in_yet_is_warned_of_and_taken_up_when_it_is(t
         links.flush()
         assert list(links.receive()) == []
         radio = Radio(name)
-        assert list(links.receive()) == []  # opens it
-        os.write(radio.ours, heartbeat())
-        assert b"".join(r.data for r in received(links, 1)) == heartbeat()
-        links.send(None, b"answer")
-        links.flush()
-        assert os.read(radio.ours, 100) == b"answer"
+        _talks(links, radio)
     radio.pull()
 
 
