@@ -171,19 +171,21 @@ class MagnetLimiter:
 
     def retune(self, parameters: LimiterParameters) -> None:
         """Applies new limits from this tick on; accounts stay."""
-        self._p, self._is_cold = parameters, False
+        self._p = parameters
+        self._settled_for: tuple[int, ...] | None = None
+        """Wanted states for which another tick changes nothing: full accounts stay full, also those of magnets that may be on for ever."""
 
     def step(self, wanted: Sequence[int]) -> tuple[int, ...]:
         """Returns the permitted relay states of this tick; an unknown state counts as off. To be called in every tick."""
-        if self._is_cold and not any(wanted):
+        asked = tuple(wanted)
+        if asked == self._settled_for:
             return self.states
         full, duty = self._p.relay_on_s, self._p.relay_duty
-        on = [state in (RELAY_PULL, RELAY_PUSH) and not resting for state, resting in zip(wanted, self._resting, strict=True)]
-        for face in range(FACES):
-            left_s = min(full, self._left_s[face] + self._dt_s * (duty - on[face]))
-            self._resting[face] = left_s < 0.5 * full if self._resting[face] else left_s <= 0.0
-            self._left_s[face] = left_s
-        self._is_cold = not any(on) and self._left_s == [full] * FACES
+        on = [state in (RELAY_PULL, RELAY_PUSH) and not rests for state, rests in zip(asked, self._resting, strict=True)]
+        left_s = [min(full, left + self._dt_s * (duty - lit)) for left, lit in zip(self._left_s, on, strict=True)]
+        resting = [left < 0.5 * full if rests else left <= 0.0 for left, rests in zip(left_s, self._resting, strict=True)]
+        self._settled_for = asked if (left_s, resting) == (self._left_s, self._resting) else None
+        self._left_s, self._resting = left_s, resting
         self.power_w = sum(on) * self._p.relay_w
-        self.states = tuple(state if lit else RELAY_OFF for state, lit in zip(wanted, on, strict=True))
+        self.states = tuple(state if lit else RELAY_OFF for state, lit in zip(asked, on, strict=True))
         return self.states

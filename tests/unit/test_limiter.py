@@ -1,5 +1,6 @@
 """The final limits of every thruster: force, slew, supply power and arm state, sampled densely around each boundary."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -339,10 +340,25 @@ def test_all_six_magnets_may_rest_at_once() -> None:
     assert magnets.resting == [0, 1, 2, 3, 4, 5]
 
 
-def test_magnets_with_full_accounts_that_nobody_wants_cost_nothing() -> None:
-    magnets = MagnetLimiter(MAGNETS, 0.25)
-    magnets.step((0,) * 6)
-    assert magnets.step((0,) * 6) is magnets.step((0,) * 6)
+@pytest.mark.parametrize(("duty", "wanted"), [(0.25, (0,) * 6), (1.0, (0,) * 6), (1.0, ON), (1.0, [*ON])])
+def test_magnets_whose_accounts_stay_full_cost_nothing(duty: float, wanted: Sequence[int]) -> None:
+    """Those that nobody wants, and those of joints, which may be on for ever."""
+    magnets = MagnetLimiter(replace(MAGNETS, relay_duty=duty), 0.25)
+    magnets.step(wanted)
+    assert magnets.step(wanted) is magnets.step(wanted)
+    assert magnets.step((0, 1, 0, 0, 0, 0)) == (0, 1, 0, 0, 0, 0)
+
+
+def test_magnet_that_rested_is_on_again_when_a_new_limit_makes_its_account_full() -> None:
+    """Its account, at -0.0625 s when it goes off and 2 s after 33 ticks, is less than half full; by the new limit it is full and stays so."""
+    magnets = MagnetLimiter(replace(MAGNETS, relay_on_s=8.0), 0.25)
+    while not magnets.resting:
+        magnets.step((1,) * 6)
+    for _ in range(33):
+        magnets.step((0,) * 6)
+    assert magnets.resting
+    magnets.retune(MAGNETS)
+    assert [magnets.step((1,) * 6) for _ in range(2)] == [(0,) * 6, (1,) * 6]
 
 
 def test_cool_magnet_saves_no_more_than_its_limit() -> None:
