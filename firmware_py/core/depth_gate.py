@@ -43,6 +43,8 @@ none near between them show an offset, and so many accepted ones make it trusted
 SETTLED = 100
 """Readings, two seconds of DEPTH frames, without a jump, after which a body that does not fly believes a sensor that had jumped: after a
 silence, or a false first reading, nothing else would give the depth back without tags."""
+LEVEL = (0.0, 0.0, 1.0)
+"""Downward unit vector of a level body."""
 NEAR_SHARE = 0.5
 """Share of the gate within which a reading is near: 2.5 sigmas of the innovation, beyond which one reading in 80 is by chance. A sensor at
 the edge of the gate has every other reading refused, and no near one."""
@@ -56,9 +58,10 @@ class DepthGate:
     """
 
     def __init__(self, body: Body) -> None:
-        self._r_bi = dict(zip(body.modules, body.r_bi.tolist(), strict=True))
         self._most_pa = 1.1 * ATMOSPHERE_PA + MOST_RATING * body.depth_rating_m * PA_PER_M
         self._sensors = {module: _Sensor() for module in body.modules}
+        self._r_bi = body.r_bi
+        """(m, 3) places of the sensors, in the order of `_sensors`."""
         self.heard = False
 
     def take_over(self, before: Sequence[DepthGate]) -> None:
@@ -71,8 +74,8 @@ class DepthGate:
         for pose in pictures:
             down = to_matrix(pose.q_wb)[2]
             depth_m = float(pose.p_wt[2] - down.dot(pose.lever_b))
-            for index, sensor in self._sensors.items():
-                sensor.datum.compare(pose.capture_ns, depth_m + float(down.dot(self._r_bi[index])))
+            for sensor, below_m in zip(self._sensors.values(), self._r_bi.dot(down).tolist(), strict=True):
+                sensor.datum.compare(pose.capture_ns, depth_m + below_m)
 
     def step(
         self, time_ns: int, modules: Sequence[ModuleInputs], expected: ExpectedDepth | None, armed: bool
@@ -86,27 +89,17 @@ class DepthGate:
                 body may fall into the water.
         """
         self.heard, believed = False, list(modules)
-        for index, sensor in self._sensors.items():
+        below_m = self._r_bi.dot(LEVEL if expected is None else expected.down_b).tolist()
+        for k, (index, sensor) in enumerate(self._sensors.items()):
             pressure_pa = modules[index].pressure_pa
             if pressure_pa is None:
                 continue
-            passed = LEAST_PA <= pressure_pa <= self._most_pa and self._passes(index, time_ns, pressure_pa, expected, armed)
+            passed = LEAST_PA <= pressure_pa <= self._most_pa and sensor.passes(time_ns, pressure_pa, expected, below_m[k], armed)
             self.heard = self.heard or passed
             if not passed or sensor.offset_m:
                 corrected_pa = pressure_pa - sensor.offset_m * PA_PER_M if passed else None
                 believed[index] = dataclasses.replace(modules[index], pressure_pa=corrected_pa)
         return believed
-
-    def _passes(self, index: int, time_ns: int, pressure_pa: float, expected: ExpectedDepth | None, armed: bool) -> bool:
-        """Whether a possible reading may be used."""
-        sensor, told_m = self._sensors[index], (pressure_pa - ATMOSPHERE_PA) / PA_PER_M
-        sensor.hear(time_ns, told_m, MOST_SPEED_M_S if armed else DROP_SPEED_M_S)
-        if expected is None:
-            return sensor.is_continuous(armed)
-        below_m = sum(r * down for r, down in zip(self._r_bi[index], expected.down_b, strict=True))
-        error_m = told_m - below_m - expected.depth_m
-        most_m = MOST_STEP_M if armed and sensor.was_trusted else math.inf
-        return sensor.agrees(error_m, max(LEAST_GATE_M, GATE_SIGMAS * expected.sigma_m), most_m)
 
 
 class _Sensor:
@@ -127,6 +120,15 @@ class _Sensor:
         """Last possible reading, and how far the sensor has jumped since it last agreed with tags or came back."""
         self._unbroken, self._only_jumped = 0, False
         """Readings since it last jumped; whether a jump is all that it is distrusted for."""
+
+    def passes(self, time_ns: int, pressure_pa: float, expected: ExpectedDepth | None, below_m: float, armed: bool) -> bool:
+        """Whether a possible reading may be used. `below_m` is how far the sensor is expected below the centre of mass."""
+        told_m = (pressure_pa - ATMOSPHERE_PA) / PA_PER_M
+        self.hear(time_ns, told_m, MOST_SPEED_M_S if armed else DROP_SPEED_M_S)
+        if expected is None:
+            return self.is_continuous(armed)
+        most_m = MOST_STEP_M if armed and self.was_trusted else math.inf
+        return self.agrees(told_m - below_m - expected.depth_m, max(LEAST_GATE_M, GATE_SIGMAS * expected.sigma_m), most_m)
 
     def hear(self, time_ns: int, depth_m: float, speed_m_s: float) -> None:
         """Notes a possible reading, and whether the sensor jumped to it: farther than a body goes at `speed_m_s` since the one before."""

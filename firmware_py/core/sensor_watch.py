@@ -28,11 +28,11 @@ DEPTH_REPEATS = 100
 LEAPS = {"gyro": 1.0, "accel": 2.0, "pressure_pa": 2000.0}
 """Largest plausible change between samples, rad/s, m/s^2, Pa. A module's full moment, 3.2 N m on 0.088 kg m^2, adds 0.7 rad/s in a tick at
 50 Hz; its force, 40 N on 15.5 kg, has a lag of 80 ms: reversed, 1.2 m/s^2 in that tick. Twenty centimetres of water are 2000 Pa."""
-FROZEN = {"gyro": None, "accel": None}
-"""Replacement fields for the samples of a stuck IMU."""
+GYRO, ACCEL, PRESSURE = MARKS = (1, 2, 4)
+"""Marks of the sensors in LEAPS; of several, their sum."""
+SENSORS = tuple(zip(MARKS, (0, 3, 6), (3, 6, 7), LEAPS.values(), strict=True))
+"""Mark of each sensor, the first of its numbers among the seven of a module, the end of them, and its leap."""
 NOTHING = np.full(3, np.nan)
-Trace = tuple[np.ndarray, np.ndarray]
-"""The last accepted sample (k,), and the rejected one that followed it; NaN where there is none."""
 
 
 class SensorWatch:
@@ -66,35 +66,21 @@ class _ModuleWatch:
     """Watches the sensors of one module, whichever body it is in."""
 
     def __init__(self) -> None:
-        self._imu, self._imu_repeats = np.full(6, np.nan), np.zeros(6, dtype=np.int64)
-        """Last numbers of gyro and accelerometer, and how often each has been repeated; unchanged while none comes."""
-        self._last_pa, self._pressure_repeats = math.nan, 0
-        self._traces: dict[str, Trace] = {}
+        self._memory = (*(np.full(7, np.nan) for _ in range(3)), np.zeros(7, dtype=np.int64))
+        """What `judge` remembers."""
 
     def step(self, module: ModuleInputs) -> ModuleInputs:
         """The module's inputs without implausible samples."""
-        gyro, accel = (NOTHING if sample is None else sample for sample in (module.gyro, module.accel))
-        gone: dict[str, Any] = {name: None for name in LEAPS if self._leaps(name, getattr(module, name))}
-        if is_stuck(gyro, accel, self._imu, self._imu_repeats):
-            gone |= FROZEN
-        if module.pressure_pa is not None and self._pressure_repeats_itself(module.pressure_pa):
-            gone["pressure_pa"] = None
-        return dataclasses.replace(module, **gone) if gone else module
-
-    def _pressure_repeats_itself(self, pressure_pa: float) -> bool:
-        self._pressure_repeats = self._pressure_repeats + 1 if pressure_pa == self._last_pa else 0
-        self._last_pa = pressure_pa
-        return self._pressure_repeats >= DEPTH_REPEATS
-
-    def _leaps(self, name: str, reading: np.ndarray | float | None) -> bool:
-        """Whether a reading is far from the last accepted one, and also from a rejected one that followed it."""
-        if reading is None:
-            return False
-        sample = reading if isinstance(reading, np.ndarray) else np.array([reading])
-        sound, odd = self._traces.get(name, (sample, NOTHING))
-        is_odd = not (is_near(sample, sound, LEAPS[name]) or is_near(sample, odd, LEAPS[name]))
-        self._traces[name] = (sound, sample) if is_odd else (sample, NOTHING)
-        return is_odd
+        gyro, accel, pressure_pa = module.gyro, module.accel, module.pressure_pa
+        came = GYRO * (gyro is not None) + ACCEL * (accel is not None) + PRESSURE * (pressure_pa is not None)
+        wrong = judge(
+            came, NOTHING if gyro is None else gyro, NOTHING if accel is None else accel,
+            math.nan if pressure_pa is None else pressure_pa, *self._memory,
+        )  # fmt: skip
+        if not wrong:
+            return module
+        gone: dict[str, Any] = {name: None for name, mark in zip(LEAPS, MARKS, strict=True) if wrong & mark}
+        return dataclasses.replace(module, **gone)
 
 
 @njit(f"boolean({V},{V},float64)", cache=True)
@@ -106,19 +92,42 @@ def is_near(a, b, reach):  # type: ignore[no-untyped-def]
     return near
 
 
-@njit(f"boolean({V},{V},{V},int64[::1])", cache=True)
-def is_stuck(gyro, accel, last, repeats):  # type: ignore[no-untyped-def]
-    """Whether a gyro or an accelerometer has repeated itself too often; takes their new samples into account.
+@njit(f"boolean({V},{V},{V},float64)", cache=True)
+def leaps(sample, sound, odd, reach):  # type: ignore[no-untyped-def]
+    """Whether a sample (k,) is far from the last accepted one, and also from a rejected one that followed it; both are updated."""
+    expected = sample if math.isnan(sound[0]) else sound
+    is_odd = not (is_near(sample, expected, reach) or is_near(sample, odd, reach))
+    if is_odd:
+        odd[:] = sample
+    else:
+        sound[:], odd[:] = sample, math.nan
+    return is_odd
+
+
+@njit(f"int64(int64,{V},{V},float64,{V},{V},{V},int64[::1])", cache=True)
+def judge(came, gyro, accel, pressure_pa, sound, odd, last, repeats):  # type: ignore[no-untyped-def]
+    """Marks of the sensors of a module whose samples are not plausible.
 
     Args:
-        gyro, accel: (3,) new samples, rad/s and m/s^2; NaN where none came.
-        last, repeats: (6,) last numbers of both, and how often each was repeated; updated.
+        came: marks of the sensors whose samples came.
+        gyro, accel: (3,) new samples, rad/s and m/s^2; like `pressure_pa` NaN where none came.
+        sound, odd, last, repeats: (7,) numbers of gyro, accelerometer and pressure, all updated: of the last accepted samples, of a
+            rejected sample that followed, NaN where there is none, of the last samples, and how often each of these was repeated.
     """
-    for i in range(6):
-        number = gyro[i] if i < 3 else accel[i - 3]
-        if not math.isnan(number):
-            repeats[i] = repeats[i] + 1 if number == last[i] else 0
-            last[i] = number
-    of_gyro, of_accel = repeats[:3].min(), repeats[3:].min()
-    of_one, of_all = repeats.max(), min(of_gyro, of_accel)
-    return of_one >= AXIS_REPEATS or max(of_gyro, of_accel) >= SENSOR_REPEATS or of_all >= IMU_REPEATS
+    new = np.empty(7)
+    new[:3], new[3:6], new[6] = gyro, accel, pressure_pa
+    wrong = 0
+    for mark, first, end, reach in SENSORS:
+        if came & mark and leaps(new[first:end], sound[first:end], odd[first:end], reach):
+            wrong |= mark
+    for i in range(7):
+        if not math.isnan(new[i]):
+            repeats[i] = repeats[i] + 1 if new[i] == last[i] else 0
+            last[i] = new[i]
+    of_gyro, of_accel = repeats[:3].min(), repeats[3:6].min()
+    of_one, of_all = repeats[:6].max(), min(of_gyro, of_accel)
+    if of_one >= AXIS_REPEATS or max(of_gyro, of_accel) >= SENSOR_REPEATS or of_all >= IMU_REPEATS:
+        wrong |= GYRO | ACCEL
+    if repeats[6] >= DEPTH_REPEATS:
+        wrong |= PRESSURE
+    return wrong
