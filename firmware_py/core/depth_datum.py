@@ -7,9 +7,13 @@ the motion of the body nor the filter matters. What is left is the sensor's offs
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import deque
+
+import numpy as np
+from numba import njit
+
+from firmware_py.core.rotations import V
 
 READINGS = 32
 """Readings kept, 0.64 s of DEPTH frames: the bus refuses pictures older than half a second."""
@@ -33,7 +37,8 @@ class DepthDatum:
 
     def __init__(self) -> None:
         self._readings: deque[tuple[int, float]] = deque(maxlen=READINGS)
-        self._offsets: deque[float] = deque(maxlen=PICTURES)
+        self._offsets = np.full(PICTURES, np.nan)
+        """By the latest pictures, oldest first; NaN until there are as many."""
         self._usual_m = math.nan
         self.shift_m = self._change_m = math.nan
         """Present offset less the usual one, and change of the offset within the pictures kept, m; NaN until known."""
@@ -57,17 +62,15 @@ class DepthDatum:
         told_m = self._told_at(capture_ns)
         if math.isnan(told_m):
             return
-        self._offsets.append(told_m - depth_m)
-        if len(self._offsets) < PICTURES:
+        earlier_m, later_m, present_m = append(self._offsets, told_m - depth_m)
+        if math.isnan(earlier_m):
             return
-        half = PICTURES // 2
-        earlier, later = sum(itertools.islice(self._offsets, half)), sum(itertools.islice(self._offsets, half, None))
-        self._change_m = (later - earlier) / half
+        self._change_m = later_m - earlier_m
         if math.isnan(self._usual_m) and self.is_steady:
-            self._usual_m = (earlier + later) / PICTURES
-        self.shift_m = sum(itertools.islice(self._offsets, PICTURES - LATEST, None)) / LATEST - self._usual_m
+            self._usual_m = 0.5 * (earlier_m + later_m)
+        self.shift_m = present_m - self._usual_m
         if not self.errs:
-            self._usual_m += (self._offsets[-1] - self._usual_m) / USUAL_OF
+            self._usual_m += (told_m - depth_m - self._usual_m) / USUAL_OF
 
     def take_as_usual(self) -> None:
         """Counts the present offset as the usual one, if both are known."""
@@ -78,8 +81,7 @@ class DepthDatum:
         """Whether a figure is beyond its limit, which grows with the noise of the pictures kept. A NaN is not."""
         if not abs(value_m) > limit_m:
             return False
-        steps = sorted(abs(after - before) for before, after in itertools.pairwise(self._offsets))
-        return abs(value_m) > limit_m * max(1.0, steps[PICTURES // 2 - 1] / (MEDIAN_STEP * NOISE_M))
+        return abs(value_m) > limit_m * max(1.0, median_step(self._offsets) / (MEDIAN_STEP * NOISE_M))
 
     def _told_at(self, time_ns: int) -> float:
         """Depth by the sensor at a time between two readings, m; NaN elsewhere."""
@@ -90,3 +92,17 @@ class DepthDatum:
                 return depth_m + share * (after_m - depth_m)
             after_ns, after_m = at_ns, depth_m
         return math.nan
+
+
+@njit(f"UniTuple(float64,3)({V},float64)", cache=True)
+def append(offsets, newest):  # type: ignore[no-untyped-def]
+    """Appends an offset (m) and drops the oldest. Returns the means of the earlier half, of the later half and of the LATEST."""
+    offsets[:-1] = offsets[1:]
+    offsets[-1] = newest
+    return offsets[: PICTURES // 2].mean(), offsets[PICTURES // 2 :].mean(), offsets[PICTURES - LATEST :].mean()
+
+
+@njit(f"float64({V})", cache=True)
+def median_step(offsets):  # type: ignore[no-untyped-def]
+    """Median change from one offset (m) to the next; NaN while there are too few."""
+    return np.median(np.abs(np.diff(offsets)))
