@@ -81,7 +81,8 @@ class DepthDatum:
         """Whether a figure is beyond its limit, which grows with the noise of the pictures kept. A NaN is not."""
         if not abs(value_m) > limit_m:
             return False
-        return abs(value_m) > limit_m * max(1.0, median_step(self._offsets) / (MEDIAN_STEP * NOISE_M))
+        noise_m: float = median_step(self._offsets) / MEDIAN_STEP
+        return abs(value_m) > limit_m * max(1.0, noise_m / NOISE_M)
 
     def _told_at(self, time_ns: int) -> float:
         """Depth by the sensor at a time between two readings, m; NaN elsewhere."""

@@ -350,7 +350,7 @@ def test_magnets_whose_accounts_stay_full_cost_nothing(duty: float, wanted: Sequ
 
 
 def test_magnet_that_rested_is_on_again_when_a_new_limit_makes_its_account_full() -> None:
-    """Its account, at -0.0625 s when it goes off and 2 s after 33 ticks, is less than half full; by the new limit it is full and stays so."""
+    """Its account, at -0.0625 s when it goes off and 2 s after 33 ticks, is less than half full; by the new limit it is full, and stays."""
     magnets = MagnetLimiter(replace(MAGNETS, relay_on_s=8.0), 0.25)
     while not magnets.resting:
         magnets.step((1,) * 6)
