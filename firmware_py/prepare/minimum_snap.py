@@ -161,15 +161,10 @@ def distinct(waypoints: Sequence[Waypoint], same: float = _SAME) -> tuple[list[W
 
 def _fit(request: _Request, base: np.ndarray, free: bool) -> Piecewise:
     """The trajectory with the smallest feasible stretch of all of `base`; the stretch is below 1 only where durations are free."""
-    high, best = 1.0, request.try_stretch(base, 1.0)
-    low = 1.0
-    while best is None:
-        low, high = high, 2.0 * high
-        if high > _LONGEST_STRETCH:
-            request.attempt(base * low)
-        best = request.try_stretch(base, high)
+    high, best = _first_feasible(request, base, both_ways=free and request.passes_at_speed())
     if high == 1.0 and not free:
         return best
+    low = 0.5 * high if high > 1.0 else high
     while low == high:
         shorter = request.try_stretch(base, 0.5 * low)
         if shorter is None:
@@ -184,6 +179,17 @@ def _fit(request: _Request, base: np.ndarray, free: bool) -> Piecewise:
         else:
             best, high = tried, middle
     return replace(best, stretch=1.0) if free else best
+
+
+def _first_feasible(request: _Request, base: np.ndarray, both_ways: bool) -> tuple[float, Piecewise]:
+    """The first feasible stretch of `base` out of 1, 2, 4, ..., or out of 1, 2, 1/2, 4, 1/4, ..., and its trajectory."""
+    factor = 1.0
+    while factor <= _LONGEST_STRETCH:
+        for tried in (factor, 1.0 / factor) if both_ways else (factor,):
+            if (found := request.try_stretch(base, tried)) is not None:
+                return tried, found
+        factor *= 2.0
+    return _LONGEST_STRETCH, request.attempt(base * _LONGEST_STRETCH)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,6 +230,10 @@ class _Request:
             (limits.angular_acceleration, turns),
         )
         return any(bound is not None and bool(np.any(np.isfinite(bound) & where)) for bound, where in bounds)
+
+    def passes_at_speed(self) -> bool:
+        """Whether a velocity is given somewhere. It is reached and lost again on the way, so that long durations may be infeasible."""
+        return bool(np.any(self.position.derivative[:, 0]))
 
     def durations(self, asked: Sequence[float] | float | None) -> np.ndarray:
         """(n - 1,) durations to start from, s."""

@@ -148,6 +148,18 @@ def test_time_is_stretched_no_more_than_the_limit_asks() -> None:
         plan(waypoints, shorter, limits, stretch=False)
 
 
+def test_free_durations_are_found_though_a_given_velocity_bounds_them_from_above() -> None:
+    """At 1.5 m/s through the middle of a narrow corridor, a path that takes the 20 s with which the search begins would overshoot."""
+    at = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
+    waypoints = [Waypoint(at[0]), Waypoint(at[1], velocity_w=np.array([1.5, 0.0, 0.0])), Waypoint(at[2])]
+    limits = Limits(acceleration=np.full(3, 2.0), corridor_m=0.02)
+    with pytest.raises(InfeasibleError, match=r"keeps the corridor"):
+        plan(waypoints, 20.0, limits, stretch=False)
+    found = plan(waypoints, limits=limits)
+    assert found.duration_s < 5.0
+    assert extremes(found)[1].max() == pytest.approx(2.0, rel=5e-3)
+
+
 STOPS = [Waypoint(np.array(p, dtype=float), stop=True) for p in ((0, 0, 0), (1, 0, 0), (1, 1, 0))]
 
 
