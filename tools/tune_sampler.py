@@ -53,6 +53,8 @@ class GaussianProcessSampler(optuna.samplers.BaseSampler):
         y = logarithms(done)
         near = [x[np.argmin(y)] + spread * rng.standard_normal((NEAR, x.shape[1])) for spread in NEARNESS]
         candidates = np.clip(np.vstack([rng.uniform(size=(ANYWHERE, x.shape[1])), *near]), 0.0, 1.0)
+        flown = (candidates[:, None] == x).all(axis=2).any(axis=1)  # at bounds; the same gains would fly the same again
+        candidates = candidates[~flown]
         return self._values(candidates[np.argmax(expected_improvement(x, y, candidates))])
 
     def sample_independent(self, study: optuna.Study, trial: FrozenTrial, param_name: str, param_distribution: BaseDistribution) -> Any:

@@ -148,6 +148,21 @@ def test_objective_that_reaches_zero_is_searched_on(tools: tuple[Any, Any], tmp_
 
 
 @pytest.mark.slow
+def test_gains_that_are_best_at_their_bounds_are_not_flown_twice(
+    tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fly(scenario: Scenario, parameters: Parameters, seed: int, bus: str, code: str) -> dict[str, Any]:
+        return {"seed": seed, "metrics": {"position_rmse_m": 0.001, "thrust_rms_n": 20.0 - parameters.control.position_bandwidth}}
+
+    monkeypatch.setattr(tools[1], "fly_trial", fly)
+    start, searched = OBJECTIVE.index("    { parameter"), OBJECTIVE.index("]\nterm")
+    objective = OBJECTIVE[:start] + f'{{ parameter = "{BANDWIDTH}", low = 0.5, high = 8.0 }}' + OBJECTIVE[searched:]
+    study = tools[1].search(objective_of(tools, tmp_path, objective), START, 14, tmp_path, Inline(), 0, lambda progress: None)
+    assert study.best_params == {BANDWIDTH: 8.0}
+    assert len({trial.params[BANDWIDTH] for trial in study.trials}) == 14
+
+
+@pytest.mark.slow
 def test_other_seed_searches_elsewhere(tools: tuple[Any, Any], tmp_path: Path) -> None:
     first, second = (search(tools, tmp_path / str(seed), 5, Inline(), seed) for seed in (0, 1))
     assert first.trials[0].params == second.trials[0].params and first.trials[1].params != second.trials[1].params
