@@ -35,10 +35,12 @@ from accept_measures import (
 from accept_safety import SAFETY
 from accept_tuning import TUNING
 from argument_types import make_room, run_command
+from readme_tables import read_source
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from firmware_py.description.schema import DescriptionError
 from hil.checks import limit_text
 
 OUT = Path("accept.json")
@@ -74,8 +76,14 @@ def outcomes(group: Group, values: Values) -> list[Outcome]:
 
 
 def read_outcomes(path: Path) -> list[dict[str, Any]]:
-    """Entries of accept.json; an empty list when the file does not exist."""
-    return json.loads(path.read_text(encoding="utf-8")) if path.exists() else []
+    """Entries of accept.json; an empty list when the file does not exist. Raises DescriptionError where it holds anything else."""
+    try:
+        entries = read_source(path) if path.exists() else []
+    except ValueError as error:
+        raise DescriptionError(str(error)) from None
+    if any("group" not in entry for entry in entries):
+        raise DescriptionError(f"{path}: not the figures of an earlier run; give another --out or delete it")
+    return list(entries)
 
 
 def write_outcomes(path: Path, measured: Sequence[Outcome], known: Sequence[Group]) -> list[dict[str, Any]]:
@@ -110,6 +118,7 @@ def main(
     if unknown := set(only or ()) - set(names):
         raise typer.BadParameter(f"{', '.join(sorted(unknown))}: unknown; there are {', '.join(names)}")
     make_room(out)
+    read_outcomes(out)  # before the hours of work start
     os.environ["OPENBLAS_NUM_THREADS"] = "1"  # for the processes that fly
     measured: list[Outcome] = []
     for group in GROUPS:

@@ -4,8 +4,10 @@ import json
 import subprocess
 from pathlib import Path
 
+import accept
 import pytest
 from accept_measures import LOGS, loop_margins, repeated
+from argument_types import run_command
 
 
 @pytest.mark.parametrize("measure", [loop_margins, repeated])
@@ -19,3 +21,17 @@ def test_figures_of_an_earlier_run_are_not_those_of_one_that_fails(measure, tmp_
     monkeypatch.setattr(subprocess, "run", lambda command, **how: subprocess.CompletedProcess(command, 2))
     with pytest.raises(FileNotFoundError):
         measure(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["{half", "{}", "[1]", '[{"name": "of bench.json"}]'])
+def test_file_that_holds_no_figures_is_refused_before_anything_is_measured(
+    text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "accept.json"
+    out.write_text(text)
+    monkeypatch.setattr(accept, "GROUPS", ())
+    monkeypatch.setattr("sys.argv", ["accept", "--out", str(out)])
+    assert run_command(accept.app, "accept") == 2
+    said = capsys.readouterr().err
+    assert said.startswith(f"accept: {out}: no") and said.count("\n") == 1
+    assert out.read_text() == text
