@@ -81,12 +81,19 @@ def _rows(path: Path) -> list[dict[str, str | None]]:
             for name in header:
                 if name not in (*COLUMNS, *OPTIONAL) and (hint := did_you_mean(name, [n for n in OPTIONAL if n not in header])):
                     raise DescriptionError(f"{path}:1: column '{name}' is unknown; {hint}else give it another name or leave it out")
-            rows = list(reader)
+            rows = [_whole(row, path, line) for line, row in enumerate(reader, 2)]
     except (UnicodeDecodeError, csv.Error) as error:
         raise DescriptionError(f"{path}: is no CSV in UTF-8: {error}") from None
     if not rows:
         raise DescriptionError(f"{path}: no measurement follows the header")
     return rows
+
+
+def _whole(row: dict[str, str | None], path: Path, line: int) -> dict[str, str | None]:
+    """Returns a row that has no more columns than the header. Raises DescriptionError."""
+    if None in row:
+        raise DescriptionError(f"{path}:{line}: has more columns than the header; decimals need a point")
+    return row
 
 
 def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: float, zero_n: float) -> tuple[ThrusterCurve, float]:

@@ -86,6 +86,7 @@ def test_file_that_is_written_is_a_vehicle_files_curve(
         ("command,force_n\n0,zero\n", "2: 'zero' is not a number"),
         ("command,force_n\n0,0\n1.5,3\n", "3: command 1.5 is out of range"),
         ("command,force_n\n1,5\n", "forward: 1 points"),
+        ("command,force_n\n0,0\n1,5,02\n", "3: has more columns than the header; decimals need a point"),
         ("", "no column command, force_n"),
         ("command,force_n,voltage\n0,0,16\n", "1: column 'voltage' is unknown; did you mean voltage_v?"),
         ("command,force_n\n", "no measurement follows the header"),
