@@ -84,11 +84,16 @@ def make_room(out: Path) -> None:
     _try_folder(out.parent, out)
 
 
-def _try_folder(folder: Path, out: Path) -> None:
+def check_folder(option: str, folder: Path) -> None:
+    """Creates the folder that `option` names and checks that it is writable. Raises DescriptionError."""
+    _try_folder(folder, folder, option)
+
+
+def _try_folder(folder: Path, given: Path, option: str = "--out") -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=folder).close()
     except FileExistsError:
-        raise DescriptionError(f"--out {out}: {folder} is a file; a folder is needed") from None
+        raise DescriptionError(f"{option} {given}: {folder} is a file; a folder is needed") from None
     except OSError as error:
-        raise DescriptionError(f"--out {out}: cannot be written: {error.strerror}") from None
+        raise DescriptionError(f"{option} {given}: cannot be written: {error.strerror}") from None

@@ -18,7 +18,7 @@ from command_line import run_tool
 
 import numpy as np
 import typer
-from argument_types import cells_in, make_room, run_command
+from argument_types import cells_in, check_folder, make_room, run_command
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -198,6 +198,8 @@ def main(
     check_docks(description, shapes)
     check_format(out)
     make_room(out)
+    if cache is not None:
+        check_folder("--cache", cache)
     modes = list(METHODS) if compare else [mode]
     tables = {shape: {m: table_of(description, placed, m, store) for m in modes} for shape, placed in shapes.items()}
     if description.assumption:

@@ -313,6 +313,13 @@ def test_picture_that_cannot_be_written_is_refused_in_one_line(place: str, tmp_p
     assert not (tmp_path / "folder.png").exists()
 
 
+def test_cache_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    given = drag_tool("--cells", "0,0,0", "--cache", str(tmp_path / "file"), "--out", str(tmp_path / "spaces.png"))
+    assert isinstance(given.exception, DescriptionError)
+    assert str(given.exception) == f"--cache {tmp_path / 'file'}: {tmp_path / 'file'} is a file; a folder is needed"
+
+
 def test_picture_is_right_handed_with_z_down_and_its_table_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))
