@@ -166,6 +166,12 @@ def test_equal_total_thrust_gives_every_robot_eight_newtons() -> None:
         one_of_seven("bluerov2").normalised("fancy")
 
 
+def test_wrench_out_of_reach_has_the_factor_zero_and_no_sign() -> None:
+    layout = of_vehicle(load_vehicle("bluerov2"))
+    factors = reach_by_programs(layout, np.vstack([np.eye(6), -np.eye(6)]))
+    assert np.any(factors == 0.0) and not np.any(np.signbit(factors))
+
+
 def test_facets_of_sixty_four_scattered_thrusters_are_not_even_tried() -> None:
     layout = of_rows("many", np.random.default_rng(1).standard_normal((64, 6)), -8.0, 10.0)
     with pytest.raises(DescriptionError, match="64 thrusters are too many"):

@@ -62,7 +62,7 @@ def _batch(layout: Layout, wrenches: np.ndarray) -> tuple[np.ndarray, np.ndarray
     )
     if result.x is None:
         raise RuntimeError(f"{layout.name}: the linear program failed: {result.message}")
-    factor = result.x.reshape(k, n + 1)[:, -1] * unit / sizes
+    factor = np.abs(result.x.reshape(k, n + 1)[:, -1]) * unit / sizes  # HiGHS gives -0.0 for wrenches out of reach
     dual = result.eqlin.marginals.reshape(k, 6)
     along = np.sum(dual * targets, axis=1)
     return factor, dual / np.where(along == 0.0, 1.0, along)[:, None] / layout.levers / sizes[:, None]
