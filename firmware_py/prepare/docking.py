@@ -92,17 +92,15 @@ def plan_undock(
     opens = [joint if joint.module in piece else turned(joint) for joint in joints if len(modules_of(joint) & piece) == 1]
     opens.sort(key=lambda joint: modules_of(joint) != wanted)
     way = _away(whole, piece, [_cell_of(whole, joint.module) - _cell_of(whole, joint.target_module) for joint in opens])
-    rest, leaves = (
-        assemble(
-            np.array([_cell_of(whole, m) for m in half]),
-            [nearest(_turn_of(whole, m)) for m in half],
-            [vehicles[m] for m in half],
-            half,
-            pitch_m,
-        )
-        for half in (stays, [m for m in whole.modules if m in piece])
-    )
-    return UndockPlan(tuple(opens), rest, leaves, way)
+    leaves = [m for m in whole.modules if m in piece]
+    return UndockPlan(tuple(opens), _part(whole, stays, vehicles, pitch_m), _part(whole, leaves, vehicles, pitch_m), way)
+
+
+def _part(whole: Body, modules: Sequence[int], vehicles: Sequence[Vehicle], pitch_m: float) -> Body:
+    """The body that these modules of a whole are on their own."""
+    cells = [_cell_of(whole, m) for m in modules]
+    turns = [nearest(_turn_of(whole, m)) for m in modules]
+    return assemble(cells, turns, [vehicles[m] for m in modules], modules, pitch_m)
 
 
 def _away(whole: Body, piece: set[int], steps: Sequence[np.ndarray]) -> np.ndarray:

@@ -152,7 +152,8 @@ class Piecewise:
             per_piece: of `grid`.
             shortest: length below which a quaternion need not be resolved.
         """
-        length = (grid := self.grid(per_piece))[..., 19:]
+        grid = self.grid(per_piece)
+        length = grid[..., 19:]
         step = np.linalg.norm(np.diff(length * grid[..., 3:7], axis=1), axis=-1)
         near = np.maximum(np.minimum(length[:, :-1, 0], length[:, 1:, 0]), shortest)
         divisible = (self.breaks[:-1] < self._middles) & (self._middles < self.breaks[1:])  # neighbouring floats have no middle

@@ -79,25 +79,31 @@ def rank(
         DescriptionError: a count without a list of shapes, or a vehicle that cannot be docked to its own kind.
     """
     shapes = polycubes(count)
-    path = task.trajectory.path() if task.trajectory else None
     found = []
-    for done, shape in enumerate(shapes):
-        tried: list[tuple[Fitness, Layout, np.ndarray]] = []
-        for cells in poses(shape):
-            if path is None or task.trajectory is None:
-                layout, wrenches = of_modules(cells, [0] * count, [vehicle] * count), task.wrench
-            else:
-                body = assemble(cells, [0] * count, [vehicle] * count, cache=cache)
-                layout, wrenches = (
-                    of_thrusters(body.name, body.thrusters),
-                    wrenches_along(path, body, task.trajectory.samples),
-                )
-            tried.append((fitness(cells, layout, wrenches), layout, wrenches))
-        best, layout, wrenches = min(tried, key=lambda entry: (_order(task, entry[0]), entry[0].cells))
-        found.append(_choice(best, len(tried), layout, wrenches, task.dead))
+    for done, shape in enumerate(shapes, 1):
+        found.append(_best_pose(task, shape, vehicle, cache))
         if progress:
-            progress(done + 1, len(shapes))
-    return sorted(found, key=lambda choice: (_order(task, choice.best), choice.best.cells))
+            progress(done, len(shapes))
+    return sorted(found, key=lambda choice: _order(task, choice.best))
+
+
+def _best_pose(task: Task, shape: Cells, vehicle: Vehicle, cache: DragCache | None) -> Choice:
+    """The pose of a shape that does the task best."""
+    tried = []
+    for cells in poses(shape):
+        layout, wrenches = _posed(task, cells, vehicle, cache)
+        tried.append((fitness(cells, layout, wrenches), layout, wrenches))
+    best, layout, wrenches = min(tried, key=lambda each: _order(task, each[0]))
+    return _choice(best, len(tried), layout, wrenches, task.dead)
+
+
+def _posed(task: Task, cells: Cells, vehicle: Vehicle, cache: DragCache | None) -> tuple[Layout, np.ndarray]:
+    """The layout of one pose, and the (k, 6) wrenches that the task asks of it."""
+    rotation, vehicles = [0] * len(cells), [vehicle] * len(cells)
+    if task.trajectory is None:
+        return of_modules(cells, rotation, vehicles), task.wrench
+    body = assemble(cells, rotation, vehicles, cache=cache)
+    return of_thrusters(body.name, body.thrusters), wrenches_along(task.trajectory.path(), body, task.trajectory.samples)
 
 
 def fitness(cells: Cells, layout: Layout, wrenches: np.ndarray) -> Fitness:
@@ -112,11 +118,11 @@ def _asked(layout: Layout, wrenches: np.ndarray) -> np.ndarray:
     return np.asarray(wrenches[np.linalg.norm(wrenches / layout.levers, axis=1) > _STILL])
 
 
-def _order(task: Task, part: Fitness) -> tuple[bool, float, float]:
-    """Sorting key: feasible shapes first. Values are rounded, so that rounding errors do not order equal shapes."""
+def _order(task: Task, part: Fitness) -> tuple[bool, float, float, Cells]:
+    """Sorting key: feasible shapes first. Values are rounded, so that rounding errors do not order equal shapes; their cells do."""
     value = {"margin": -part.margin, "power": part.power_w, "variance": part.variance}[task.rank_by]
     second = part.power_w if task.rank_by == "margin" else -part.margin
-    return part.margin < 1.0, _rounded(value), _rounded(second)
+    return part.margin < 1.0, _rounded(value), _rounded(second), part.cells
 
 
 def _rounded(value: float) -> float:
