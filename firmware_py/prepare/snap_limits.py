@@ -94,7 +94,7 @@ class Limits:
     Attributes:
         velocity: (3,) m/s, along each world axis.
         acceleration: (3,) m/s^2, along each world axis.
-        corridor_m: largest distance from the straight line between neighbouring waypoints.
+        corridor_m: largest distance from the straight line through neighbouring waypoints, and largest overshoot beyond either of them.
         angular_rate: rad/s.
         angular_acceleration: rad/s^2.
         thruster_share: share of each thruster's range that the path may use; the rest is reserved for control.

@@ -55,7 +55,9 @@ class LimitsTable:
 
     velocity_m_s: np.ndarray = quantity([], unit="m/s", low=1e-3, high=10, shape=(-1,), help="velocity limit along x, y, z")
     acceleration_m_s2: np.ndarray = quantity([], unit="m/s^2", low=1e-3, high=10, shape=(-1,), help="acceleration limit along x, y, z")
-    corridor_m: float = quantity(0.0, unit="m", low=0.0, high=100, help="largest distance from the straight line between waypoints")
+    corridor_m: float = quantity(
+        0.0, unit="m", low=0.0, high=100, help="largest distance from the straight line through two waypoints, and beyond either"
+    )
     angular_rate_rad_s: float = quantity(0.0, unit="rad/s", low=0.0, high=20, help="limit of the angular rate")
     angular_acceleration_rad_s2: float = quantity(0.0, unit="rad/s^2", low=0.0, high=100, help="limit of the angular acceleration")
     thruster_share: float = quantity(0.8, low=0.05, high=1.0, help="share of each thruster's force that the path may use")
