@@ -31,6 +31,8 @@ LEAST_SLOPE = 1e-3
 """Least slope, as a share of the mean slope: no curve is flat anywhere."""
 LEAST_POINTS = 6
 """Required on either side, beyond the deadband."""
+LOST = 10.0
+"""Force at a smaller command, as a multiple of --zero, above which a reading of zero is a lost one and no deadband."""
 COLUMNS = ("command", "force_n")
 OPTIONAL = ("voltage_v", "power_w")
 MOST = 1e6
@@ -124,6 +126,8 @@ def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: flo
         powers = np.arange(1, DEGREE + 1)
         left.append(x[:, None] ** powers @ changed[side] - y)
         idle = np.abs(u[(sign * u >= 0.0) & ~works])
+        if idle.size and np.any(y[x < idle.max()] > LOST * zero_n):
+            raise DescriptionError(f"{side}: no force at command {sign * idle.max():g}, though smaller ones push; measure that one again")
         between = 0.5 * (float(x.min()) + float(idle.max())) if idle.size else 0.0
         edges.append(float(between**powers @ changed[side]) if idle.size else 0.0)
         if "power_w" in points:

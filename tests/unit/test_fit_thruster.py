@@ -175,3 +175,10 @@ def test_thruster_that_pushes_against_its_command_is_refused() -> None:
     points["force_n"] = -points["force_n"]
     with pytest.raises(DescriptionError, match="against it"):
         tool.fit_curve(points, LIKE, 12.0, 0.05)
+
+
+def test_reading_that_was_lost_is_refused_and_makes_no_deadband() -> None:
+    points = measured()
+    points["force_n"][np.isclose(points["command"], 0.8)] = 0.0
+    with pytest.raises(DescriptionError, match=r"forward: no force at command 0\.8, though smaller ones push"):
+        tool.fit_curve(points, LIKE, 12.0, 0.05)
