@@ -41,6 +41,7 @@ from rich.console import Console
 from rich.table import Table
 
 from firmware_py.description.schema import DescriptionError
+from firmware_py.ground.files import write_atomically
 from hil.checks import limit_text
 
 OUT = Path("accept.json")
@@ -93,7 +94,7 @@ def write_outcomes(path: Path, measured: Sequence[Outcome], known: Sequence[Grou
     entries += [asdict(outcome) for outcome in measured]
     order = {group.name: i for i, group in enumerate(known)}
     entries = sorted((e for e in entries if e["group"] in order), key=lambda e: order[e["group"]])
-    path.write_text(json.dumps(entries, indent=2) + "\n", encoding="utf-8")
+    write_atomically(path, (json.dumps(entries, indent=2) + "\n").encode())
     return entries
 
 

@@ -1,6 +1,7 @@
 """Figures that `make accept` reports were measured in its own run, or are missing."""
 
 import json
+import os
 import subprocess
 from pathlib import Path
 
@@ -35,3 +36,16 @@ def test_file_that_holds_no_figures_is_refused_before_anything_is_measured(
     said = capsys.readouterr().err
     assert said.startswith(f"accept: {out}: no") and said.count("\n") == 1
     assert out.read_text() == text
+
+
+def test_figures_of_earlier_runs_survive_a_disk_that_fills_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError("No space left on device")
+
+    out = tmp_path / "accept.json"
+    earlier = json.dumps([{"group": "hover"}])
+    out.write_text(earlier)
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        accept.write_outcomes(out, [], accept.GROUPS)
+    assert out.read_text() == earlier
