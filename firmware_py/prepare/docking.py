@@ -98,7 +98,7 @@ def plan_undock(
 
 def _part(whole: Body, modules: Sequence[int], vehicles: Sequence[Vehicle], pitch_m: float) -> Body:
     """The body that these modules of a whole are on their own."""
-    cells = [_cell_of(whole, m) for m in modules]
+    cells = np.array([_cell_of(whole, m) for m in modules])
     turns = [nearest(_turn_of(whole, m)) for m in modules]
     return assemble(cells, turns, [vehicles[m] for m in modules], modules, pitch_m)
 
