@@ -110,8 +110,9 @@ def draw_search(path: Path, objective: Objective, study: optuna.Study) -> None:
     best = np.minimum.accumulate([float(t.value) for t in complete])
     top = 4.0 * best[-1]
     for trials, marker, label in ((complete, "o", "flown to the end"), (pruned, "x", "ended early")):
-        values = np.minimum([float(t.value) for t in trials], top)
-        history.plot([t.number + 1 for t in trials], values, marker, color=COLOURS["start"], markersize=4, label=label)
+        if trials:
+            values = np.minimum([float(t.value) for t in trials], top)
+            history.plot([t.number + 1 for t in trials], values, marker, color=COLOURS["start"], markersize=4, label=label)
     history.step([t.number + 1 for t in complete], best, where="post", color=COLOURS["tuned"], label="best so far")
     history.xaxis.get_major_locator().set_params(integer=True)
     history.set(xlabel="trial", ylabel="objective", ylim=(0.0, 1.04 * top), title="search; four times the best and worse lie on top")
