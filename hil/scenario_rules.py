@@ -111,6 +111,10 @@ def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:
         leaders = ", ".join(str(scenario.module[members[0]].number) for members in scenario.groups)
         what = f"{kind} steers and judges one body, and there are {len(counts)}, led by modules {leaders}"
         yield ("task", "kind"), f"{what}; give the modules one `body` number, or fly {' or '.join(SEVERAL_BODIES)}"
+    for i, module in enumerate(scenario.module):
+        if module.clamped and kind not in SEVERAL_BODIES:
+            what = f"{kind} judges how the body of module {module.number} moves, and a load cell would hold it in place"
+            yield ("module", i, "clamped"), f"{what}; leave it out, or fly {' or '.join(SEVERAL_BODIES)}"
     if kind == "force" and not {1, 2} <= set(counts):
         found = ", ".join(map(str, counts))
         yield ("task", "kind"), f"force compares a module alone with two docked ones; the bodies here have {found} modules"

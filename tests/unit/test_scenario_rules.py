@@ -70,6 +70,8 @@ def load(tmp_path: Path) -> Load:
         ("force-tracking", "body = 0\ncell = [1, 0, 0]", "body = 0\ncell = [1, 0, 0]\n[[module]]\nnumber = 4\nposition_m = [2, 0, 1]",
          "module[0]: the body of module 1 has as many modules as another"),
         ("force-tracking", "clamped = true\nbody = 0", "body = 0", "module[1]: no load cell holds the body of module 2, whose"),
+        *((name, "number = 1", "number = 1\nclamped = true", f"module[0].clamped: {kind} judges how the body of module 1 moves, and a load")
+          for name, kind in (("hover", "hover"), ("polycube", "lissajous"), ("faults", "mode"))),
         *((name, "[task]", f"{ASIDE}\n[task]", f"task.kind: {kind} steers and judges one body, and there are 2, led by modules 1, 2; give")
           for name, kind in (("hover", "hover"), ("spiral", "spiral"), ("faults", "mode"))),
         ("hover", 'kind = "hover"', 'kind = "force"', "force compares a module alone with two docked ones"),
