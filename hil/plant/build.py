@@ -81,7 +81,6 @@ def make_modules(
     Args:
         groups: modules of each body. places: seat of each module in its body.
     """
-    published = [v.drag.quadratic if len(v.drag.quadratic) == 6 else np.zeros(6) for v in vehicles]
     coefficients = [d.drag * (0.0 if len(v.drag.quadratic) else 1.0) for v, d in zip(vehicles, draws, strict=True)]
     body = np.zeros(len(vehicles), dtype=np.int64)
     for b, members in enumerate(groups):
@@ -97,8 +96,8 @@ def make_modules(
         quaternions,
         sizes,
         np.array(coefficients),
-        np.array([v.drag.linear for v in vehicles]),
-        np.array(published),
+        np.array([d.linear for d in draws]),
+        np.array([d.quadratic for d in draws]),
         row,
         sides,
         maps,

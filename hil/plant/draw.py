@@ -38,7 +38,8 @@ class ModuleDraw:
         buoyancy_n: buoyancy that acts there.
         inertia: (3, 3) of robot and entrained water about `com`.
         added: (6,) added mass about the hull centre.
-        drag: (5,) coefficients face-on, edge-on, of rotation about x, y, z.
+        drag: (5,) coefficients face-on, edge-on, of rotation about x, y, z, unused by a vehicle with `quadratic`.
+        linear, quadratic: (6,) published damping, with the same errors as face-on and rotational drag.
         gain, deadband_n: (t,) of each thruster.
         payload: payloads according to the vehicle file.
     """
@@ -51,6 +52,8 @@ class ModuleDraw:
     inertia: np.ndarray
     added: np.ndarray
     drag: np.ndarray
+    linear: np.ndarray
+    quadratic: np.ndarray
     gain: np.ndarray
     deadband_n: np.ndarray
     payload: tuple[Payload, ...] = ()
@@ -84,7 +87,8 @@ def draw_module(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> Mo
     sign = -1.0 if stream(seed, "buoyancy", module).uniform() < 0.5 else 1.0
     arm = inertial.righting_arm_m + spec.righting_spread_m * stream(seed, "righting", module).uniform(-1.0, 1.0)
     shift = np.append(spec.trim_m * stream(seed, "trim", module).uniform(-1.0, 1.0, 2), 0.0)
-    drag = vehicle.drag
+    drag, factor = vehicle.drag, spread("drag", spec.drag_spread, 5)
+    damping = factor[[0, 0, 0, 2, 3, 4]]
     root = np.sqrt(turn[:3])
     deadband = spec.deadband_low_n + (spec.deadband_high_n - spec.deadband_low_n) * stream(
         seed, "deadband", module
@@ -97,7 +101,9 @@ def draw_module(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> Mo
         buoyancy_n=(dry + entrained) * spec.gravity + sign * spec.buoyancy_error_n,
         inertia=inertial.inertia * np.outer(root, root),
         added=inertial.added * np.concatenate([mass[1:], turn[3:]]),
-        drag=np.array([drag.cd_face, drag.cd_edge, *(drag.rotational_cd,) * 3]) * spread("drag", spec.drag_spread, 5),
+        drag=np.array([drag.cd_face, drag.cd_edge, *(drag.rotational_cd,) * 3]) * factor,
+        linear=drag.linear * damping,
+        quadratic=(drag.quadratic if drag.quadratic.size else np.zeros(6)) * damping,
         gain=spread("gain", spec.gain_spread, count),
         deadband_n=deadband,
         payload=vehicle.payload,

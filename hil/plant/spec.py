@@ -48,7 +48,7 @@ class WorldSpec:
         0.15, low=0, high=0.3, help="largest relative error of the inertia about each axis, rigid and added (synthetic)"
     )
     drag_spread: float = quantity(
-        0.20, low=0, high=0.9, help="largest relative error of the face-on, edge-on and rotational drag coefficients (synthetic)"
+        0.20, low=0, high=0.9, help="largest relative error of face-on, edge-on and rotational drag, published damping included (synthetic)"
     )
     gain_spread: float = quantity(0.05, low=0, high=0.9, help="largest relative error of the force of each thruster (synthetic)")
     thruster_lag_s: float = quantity(

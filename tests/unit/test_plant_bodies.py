@@ -244,6 +244,18 @@ def test_drag_and_damping_never_give_energy() -> None:
         assert world.kinetic_energy()[0] < before
 
 
+@pytest.mark.parametrize("name", ["modcube", "bluerov2", "bluerov2_heavy"])
+def test_every_seed_has_a_drag_of_its_own_whatever_the_vehicle_file_publishes(name: str) -> None:
+    decays = set()
+    for seed in range(3):
+        world = ocean(load_vehicle(name), seed=seed, drag_spread=0.2)
+        world.set_motion(0, [0.3, 0.0, 0.0], [0.0, 0.0, 0.2])
+        run(world, 0.5)
+        decays.add((world.truth(0).v_w[0], world.truth(0).w_b[2]))
+    speeds, rates = (set(each) for each in zip(*decays, strict=True))
+    assert len(speeds) == len(rates) == 3
+
+
 def test_accelerometer_feels_what_the_motion_says() -> None:
     """Specific force against numerical differences of the velocity, while the module tumbles under thrust."""
     world = ocean(vehicle(added=UNEVEN, com_m=np.array([0.01, 0.0, 0.005])), thruster_lag_s=0.08)
