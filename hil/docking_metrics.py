@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.core.rotations import rotate
+from firmware_py.core.rotations import conjugate, exp, multiply, rotate
 from firmware_py.description.signals import Columns, read_signals
 from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS
 from hil.dock_plot import STAGES
@@ -24,6 +24,8 @@ DECLARED = STAGES.index("docked")
 """Stage of a dock in the tick in which the firmware declares two bodies joined."""
 FACING = math.cos(math.radians(30.0))
 """Least cosine between the normals of mated faces and the line from centre to centre: 30 deg, a third of a quarter turn."""
+AS_TURNED = 0.1
+"""Tolerance of the cosine of half an angle by which one of four seats, a quarter turn apart, counts as that of the least angle."""
 UNSTABLE_RAD, KEPT_UP_TICKS = math.radians(30.0), 200
 """A body whose attitude stays this far from its set-point, for this many ticks, is out of control."""
 
@@ -91,14 +93,23 @@ def is_obeyed(wishes: Sequence[bool], together: np.ndarray) -> bool:
 
 
 def _meet(scenario: Scenario, step: Step, truths: Mapping[str, Columns]) -> bool:
-    """Whether the faces that a dock step names face each other at the end of the run."""
+    """Whether the faces that a dock step names face each other at the end of the run, turned as it says."""
     active, target = (truths[f"/plant/module{scenario.index_of(number)}"] for number in step.modules)
     way = target["p_wm"][-1] - active["p_wm"][-1]
     way = way / np.linalg.norm(way)
-    return all(
+    return _is_turned(step, multiply(conjugate(target["q_wm"][-1]), active["q_wm"][-1])) and all(
         rotate(module["q_wm"][-1], FACE_NORMALS[FACE_NAMES.index(face)].astype(float)) @ along > FACING
         for module, face, along in ((active, step.face, way), (target, step.target_face, -way))
     )
+
+
+def _is_turned(step: Step, q_ta: np.ndarray) -> bool:
+    """Whether the active module, at the attitude q_ta (4,) in the target's frame, has made the step's quarter turns about the target
+    face's normal: without them it would be in the seat, of four, that turns it least. Several seats may tie.
+    """
+    quarter = 0.5 * math.pi * FACE_NORMALS[FACE_NAMES.index(step.target_face)]
+    cosines = [abs(multiply(exp(-turns * quarter), q_ta)[0]) for turns in range(4)]
+    return bool(cosines[step.quarter_turns] > max(cosines) - AS_TURNED)
 
 
 def _later_dock(scenario: Scenario, last: Step, together: np.ndarray) -> list[Step]:

@@ -91,7 +91,9 @@ class Step:
     face: str = quantity("-x", choices=FACE_NAMES, help="face of the active module")
     target_module: int = quantity(1, low=1, high=29, help="number of the target module")
     target_face: str = quantity("+x", choices=FACE_NAMES, help="face of the target module")
-    quarter_turns: int = quantity(0, low=0, high=3, help="quarter turns of the active face about its normal")
+    quarter_turns: int = quantity(
+        0, low=0, high=3, help="quarter turns of the active module about the target face's normal, from the seat that turns it least"
+    )
     both_approach: bool = quantity(False, help="whether both bodies move towards each other, as in the paper")
     position_m: np.ndarray = quantity([0, 0, 0], unit="m", low=-100, high=100, shape=(3,), help="move: target position, world")
     duration_s: float = quantity(10.0, unit="s", low=0, high=3600, help="duration of a step that is no dock or undock")

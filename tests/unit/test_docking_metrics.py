@@ -70,6 +70,15 @@ def test_dock_counts_with_the_faces_that_were_named() -> None:
     assert not is_as_asked(asked(DOCK, Step(do="undock", module=2, target_module=1)), joined)
 
 
+@pytest.mark.parametrize("turns", range(4))
+def test_dock_counts_with_the_quarter_turns_that_were_asked_for(turns: int) -> None:
+    joined = truth_of([APART, PAIR], PLACES)
+    angle = 0.5 * np.pi * turns + 0.02  # about the target face's normal, +x
+    joined["/plant/module1"]["q_wm"][:] = np.cos(0.5 * angle), np.sin(0.5 * angle), 0.0, 0.0
+    counts = [is_as_asked(asked(dataclasses.replace(DOCK, quarter_turns=wanted)), joined) for wanted in range(4)]
+    assert counts == [wanted == turns for wanted in range(4)]
+
+
 def test_module_that_is_undocked_and_docked_to_another_of_the_same_body_is_as_asked() -> None:
     """The module moves from one end of a pair to the other."""
     moved = [((0, 1, 2),), PAIR, PAIR, ((0, 1, 2),)]
