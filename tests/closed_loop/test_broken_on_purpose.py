@@ -50,6 +50,12 @@ def test_tag_glued_on_ten_degrees_askew_fails_the_flight(fly: Fly, rebuild: Rebu
 
 
 @pytest.mark.slow
+def test_force_test_of_bodies_without_thrust_fails_though_they_do_not_differ(fly: Fly) -> None:
+    lame = dataclasses.replace(shortened("force-tracking", 10.0, settle_s=5.0), fault=(Fault(kind="thruster_fake_rpm"), Fault(kind="jets")))
+    assert failed(fly(lame)) == {"force_fit1_one_off"}
+
+
+@pytest.mark.slow
 def test_drag_feed_forward_of_the_wrong_sign_fails_the_flight(fly: Fly) -> None:
     """The spiral's drag is a quarter of a newton; the disturbance estimate compensates it well enough to pass, but the error doubles."""
     wrong = Parameters().replace("control.drag_feedforward", -1.0)
