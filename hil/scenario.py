@@ -280,6 +280,7 @@ class Scenario:
 
 def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
     """Creates the world of a scenario at time 0. Raises DescriptionError."""
+    _refuse_unmet_faults(scenario, period_ns)
     vehicles = [load_vehicle(m.vehicle) for m in scenario.module]
     groups = scenario.groups
     bodies = [scenario.start.shifted(scenario.module[members[0]].start, seed, members[0]) for members in groups]
@@ -292,6 +293,14 @@ def make_world(scenario: Scenario, seed: int, period_ns: int) -> World:
         if any(scenario.module[m].clamped for m in members):
             world.clamp(body)
     return world
+
+
+def _refuse_unmet_faults(scenario: Scenario, period_ns: int) -> None:
+    """Raises DescriptionError when a fault ends before a tick meets it."""
+    for i, fault in enumerate(scenario.fault):
+        if not fault.meets_a_tick(period_ns):
+            what = f"from {fault.at_s:g} to {fault.until_s:g} s is between two ticks, {1e-6 * period_ns:g} ms apart"
+            raise DescriptionError(f"{scenario.name}: fault[{i}], {fault.kind}, {what}; it would never begin")
 
 
 def load_scenario(name: str) -> Scenario:

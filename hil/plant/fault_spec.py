@@ -123,3 +123,7 @@ class Fault:
     def is_on(self, time_ns: int) -> bool:
         """Whether the fault is active at `time_ns`."""
         return round(self.at_s * NS) <= time_ns < round(self.until_s * NS)
+
+    def meets_a_tick(self, period_ns: int) -> bool:
+        """Whether the fault is active in any tick, from the first one, at `period_ns`, on."""
+        return self.is_on(max(1, -(-round(self.at_s * NS) // period_ns)) * period_ns)

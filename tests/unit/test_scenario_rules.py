@@ -175,6 +175,19 @@ def test_fault_at_the_edge_of_what_it_takes_is_flown(load: Load, name: str, faul
     assert len(load(name, "", f"[[fault]]\nkind = {fault}").fault) == 1
 
 
+@pytest.mark.parametrize(("at_s", "until_s", "period_ns", "is_met"), [
+    (6.001, 6.009, 10_000_000, False), (6.001, 6.009, 2_500_000, True), (6.001, 6.01, 10_000_000, False), (6.001, 6.011, 10_000_000, True),
+    (6.01, 6.011, 10_000_000, True), (0.0, 0.01, 10_000_000, False), (0.0, 0.011, 10_000_000, True),
+])  # fmt: skip
+def test_fault_that_no_tick_meets_is_refused(load: Load, at_s: float, until_s: float, period_ns: int, is_met: bool) -> None:
+    scenario = load("hover", "", f'[[fault]]\nkind = "leak"\nat_s = {at_s}\nuntil_s = {until_s}')
+    if is_met:
+        make_world(scenario, 0, period_ns)
+        return
+    with pytest.raises(DescriptionError, match=r"^hover: fault\[0\], leak, from .* s is between two ticks, 10 ms apart; it"):
+        make_world(scenario, 0, period_ns)
+
+
 @pytest.fixture
 def lone_tag(tmp_path: Path) -> str:
     """A vehicle whose only tag is on its front."""
