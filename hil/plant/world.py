@@ -5,6 +5,7 @@ Only `advance` moves time. Docked modules share a body; `groups` gives the initi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -277,13 +278,20 @@ class World(DockedBodies):
         )  # fmt: skip
 
     def truth(self, module: int) -> Truth:
-        """Returns the true state of one module. Its arrays are copies, cached until the world advances."""
+        """Returns the true state of one module. Its arrays are copies, cached until the world advances.
+
+        Raises DescriptionError when it has none: the integration has become unstable.
+        """
         if module not in self._truths:
             self._truths[module] = self._look_at(module)
         return self._truths[module]
 
     def _look_at(self, module: int) -> Truth:
         seen = self._seen[module].copy()
+        if not math.isfinite(seen @ seen):
+            what = f"after {1e-9 * self.time_ns:.3g} s of seed {self.seed} the motion of the modules is beyond all numbers"
+            why = f"a force is too stiff for the sub-step of {1e-6 * self._step_ns:g} ms"
+            raise DescriptionError(f"plant: {what}: {why}; lower stiffness and damping under [world] or [dock]")
         power = self._thrusters.power[module]
         first, last = self._first[module], self._first[module + 1]
         return Truth(

@@ -9,6 +9,7 @@ from scipy.integrate import quad
 from scipy.spatial import ConvexHull
 
 from firmware_py.core import rotations
+from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.plant import drag
 from hil.plant.spec import CALM, Tank, WorldSpec
@@ -206,6 +207,15 @@ def test_module_stays_inside_the_tank_and_gains_no_energy_at_its_walls(kind: str
         farthest = max(farthest, *outward)
     assert farthest > 0.75, "it must have met a wall, or the test proves nothing"
     assert world.kinetic_energy()[0] < 0.9 * energy
+
+
+def test_wall_too_stiff_for_the_sub_step_is_named_in_place_of_a_motion_beyond_all_numbers() -> None:
+    spec = WorldSpec(**{**CALM, "wall_stiffness": 1e6, "wall_damping": 1e5, "buoyancy_error_n": 40.0})
+    world = World(spec, Tank(), [vehicle()], [Start(np.array([0.0, 0.0, 0.06]), LEVEL)], 7, PERIOD_NS)
+    with pytest.raises(DescriptionError, match=r"s of seed 7 .* too stiff for the sub-step of 2\.5 ms; lower stiffness and damping under"):
+        while world.time_ns < 5e9:
+            world.advance(PERIOD_NS)
+            world.truth(0)
 
 
 def test_drag_uses_the_outline_that_the_flow_sees() -> None:
