@@ -74,7 +74,7 @@ class Result(NamedTuple):
     warnings: tuple[str, ...] = ()
     """Warnings of the firmware, a line each (hil.metrics.warning_lines)."""
     unusual: tuple[str, ...] = ()
-    """Options that differ from the scenario or the defaults: vehicle, controller, sensors."""
+    """Options that differ from the scenario or the defaults: vehicle, controller, sensors, rate, real time."""
     what: Flown = Flown()
     no_tag_reason: str = ""
     """Why no tag was seen, in words, if the flight could not be flown for that reason."""

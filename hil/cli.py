@@ -28,6 +28,8 @@ app = typer.Typer(help="The bench: the firmware against a simulated plant on the
 
 FAILED = 1
 """Exit status when a check failed."""
+USUAL_RATE_HZ = 100
+"""Tick rate of a flight for which none is named."""
 
 ScenarioName = Annotated[str, typer.Argument(help="scenario name (see `modcube hil list`), or .toml file")]
 Controller = Annotated[str, typer.Option(help="modcube, least_power, paper, paper_sequence, or a parameter file")]
@@ -95,10 +97,11 @@ def check_reaches_others(bus: str, who: str, kinds: tuple[str, ...] = ("virtual:
         raise DescriptionError(f"bus {bus!r} does not reach another process; {who} needs udp:GROUP:PORT or socketcan:IFACE")
 
 
-def unusual_in(vehicle: str, controller: str, sensors: str) -> list[str]:
+def unusual_in(vehicle: str, controller: str, sensors: str, rate_hz: int = USUAL_RATE_HZ, realtime: bool = False) -> list[str]:
     """The options that differ from the scenario or the defaults, as parts of a folder name."""
     given = ((vehicle, ""), (controller, "modcube"), (sensors, "real"))
-    return [Path(chosen).stem for chosen, usual in given if chosen != usual]
+    timing = ((f"{rate_hz}hz", rate_hz != USUAL_RATE_HZ), ("realtime", realtime))
+    return [Path(chosen).stem for chosen, usual in given if chosen != usual] + [name for name, is_so in timing if is_so]
 
 
 @app.command()
@@ -114,7 +117,7 @@ def run(
     vehicle: Vehicle = "",
     sensors: Sensors = "real",
     plots: Annotated[bool, typer.Option(help="draw plots and write the report")] = True,
-    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="tick rate, Hz")] = 100,
+    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="tick rate, Hz")] = USUAL_RATE_HZ,
     realtime: Annotated[bool, typer.Option("--realtime", help="run firmware and plant as two processes, each on its own clock")] = False,
 ) -> None:
     """Fly one scenario; prints a table and leaves logs, plots, report.html and result.json."""
@@ -125,7 +128,7 @@ def run(
     check_rate(rate_hz)
     chosen = scenario_of(scenario, vehicle, sensors)
     parameters = parameters_of(controller)
-    unusual = unusual_in(vehicle, controller, sensors)
+    unusual = unusual_in(vehicle, controller, sensors, rate_hz, realtime)
     folder = out if out is not None else Path("runs") / "-".join([chosen.name, *unusual, *([f"seed-{seed}"] if seed else [])])
     if realtime:
         check_reaches_others(bus, "--realtime", ("virtual:", "slcan:"))  # an adapter serves one process
@@ -243,7 +246,7 @@ def plant(
     scenario: ScenarioName,
     bus: Annotated[str, typer.Option(help="CAN bus: udp:GROUP:PORT or socketcan:IFACE")],
     seed: Annotated[int, typer.Option(min=0, help="seed of all random draws of the world")] = 0,
-    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="tick rate of the firmware, Hz")] = 100,
+    rate_hz: Annotated[int, typer.Option("--rate", min=50, max=400, help="tick rate of the firmware, Hz")] = USUAL_RATE_HZ,
     out: Annotated[Path | None, typer.Option(parser=folder_of, metavar="DIR", help="folder for the log of the true motion")] = None,
     vehicle: Vehicle = "",
 ) -> None:

@@ -309,8 +309,11 @@ def test_campaigns_of_different_robots_have_folders_of_their_own(
     assert taken == [Path("runs") / folder]
 
 
-@pytest.mark.parametrize(("options", "folder"), [([], "hover"), (["--seed", "7"], "hover-seed-7")])
-def test_flights_of_different_seeds_have_folders_of_their_own(
+@pytest.mark.parametrize(("options", "folder"), [
+    ([], "hover"), (["--seed", "7"], "hover-seed-7"), (["--rate", "200"], "hover-200hz"),
+    (["--sensors", "ideal", "--realtime", "--bus", "udp:239.74.163.9:43131", "--seed", "7"], "hover-ideal-realtime-seed-7"),
+])  # fmt: skip
+def test_flights_of_different_seeds_and_timing_have_folders_of_their_own(
     options: list[str], folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """So that neither overwrites the other."""
