@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,7 @@ from hil.plant.polycube import grow
 from hil.plant.spec import CALM, HALF_A_COUNT, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
 from hil.scenario_files import scenario_file, scenario_names
-from hil.scenario_rules import mistakes
+from hil.scenario_rules import idle_keys, mistakes
 from hil.starts import places_of, refuse_in_walls, refuse_overlap, starts_of
 
 
@@ -84,8 +85,8 @@ class Step:
 
     do: str = quantity(
         choices=("dock", "undock", "move", "moebius_start", "moebius", "wait"),
-        help="dock, undock: the named faces; move: the body of `module` to position_m, as it is turned; moebius_start: to the start of the "
-        "strip; moebius: along the strip",
+        help="dock: the named faces; undock: the two modules, by whatever faces; move: the body of `module` to position_m, as it is "
+        "turned; moebius_start: to the start of the strip; moebius: along the strip",
     )
     module: int = quantity(2, low=1, high=29, help="number of the active module")
     face: str = quantity("-x", choices=FACE_NAMES, help="face of the active module")
@@ -316,7 +317,7 @@ def load_scenario(name: str) -> Scenario:
     table, source = read_toml(path)
     scenario: Scenario = build(Scenario, table, source)
     scenario = dataclasses.replace(scenario, module=find_vehicles(scenario.module, source))
-    if (mistake := next(mistakes(scenario), None)) is not None:
+    for mistake in itertools.chain(idle_keys(scenario, table), mistakes(scenario)):
         raise source.error(*mistake)
     return _with_file_text(scenario, path.parent, source)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +27,8 @@ YAWS = 37
 """Number of headings checked over the range that a seed may draw: at most 10 deg apart."""
 SEVERAL_BODIES = ("dock", "force")
 """Kinds of tasks that steer and judge every body; the others steer that of the first module alone."""
+IDLE_IN_TANK = {"box": ("radius_m", "depth_m"), "cylinder": ("size_m",)}
+"""Keys by the kind of tank that does not have them."""
 Mistake = tuple[tuple[str | int, ...], str]
 """Path of keys to the wrong entry, and the error message."""
 
@@ -35,6 +37,14 @@ def mistakes(scenario: Scenario) -> Iterator[Mistake]:
     """Yields all mistakes of a scenario as read from its file."""
     for rule in RULES:
         yield from rule(scenario)
+
+
+def idle_keys(scenario: Scenario, given: Mapping[str, Any]) -> Iterator[Mistake]:
+    """Yields the keys `given` in its file that have no effect in the scenario."""
+    kind = scenario.tank.kind
+    for key in IDLE_IN_TANK[kind]:
+        if key in given["tank"]:
+            yield ("tank", key), f"a tank of the kind {kind} has no {key}; leave it out, or give another kind"
 
 
 def metric_names(scenario: Scenario) -> list[str]:
@@ -115,6 +125,13 @@ def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:
         if module.clamped and kind not in SEVERAL_BODIES:
             what = f"{kind} judges how the body of module {module.number} moves, and a load cell would hold it in place"
             yield ("module", i, "clamped"), f"{what}; leave it out, or fly {' or '.join(SEVERAL_BODIES)}"
+    for members in scenario.groups:
+        for m in members[1:]:
+            module, leader = scenario.module[m], scenario.module[members[0]]
+            for key in ("position_m", "euler_deg"):
+                if getattr(module, key).any():
+                    what = f"module {module.number} is docked to module {leader.number}, which places and turns the body"
+                    yield ("module", m, key), f"{what}; leave it out, or give the cell"
     if kind == "force" and not {1, 2} <= set(counts):
         found = ", ".join(map(str, counts))
         yield ("task", "kind"), f"force compares a module alone with two docked ones; the bodies here have {found} modules"
