@@ -28,6 +28,7 @@ from hil.dock_plot import DOCK_PLOT, write_dock_plot
 from hil.docking_metrics import docking_metrics
 from hil.force_metrics import force_metrics
 from hil.metrics import PAPER_SPIRAL_RMSE_MM, Poses, flight_metrics, warning_lines
+from hil.plant.fault_spec import FRAME_KINDS
 from hil.plant.spec import Tank
 from hil.plots import PLOTS, Window, write_plots
 from hil.realtime import fly_in_real_time
@@ -45,6 +46,8 @@ LATE_SHARE = 0.01
 """Share of ticks that may be missing from a log in real time, because frames may be lost on a bus shared with others."""
 ARMED_AT_ALL = 0.01
 """Least share of armed ticks for a task to count as flown."""
+KEEP_TAGS_AWAY = ("tag_absent", *FRAME_KINDS)
+"""Kinds of faults by which the firmware may never hear of a tag that a camera read."""
 PAPER_RMSE_MM = {"spiral": PAPER_SPIRAL_RMSE_MM}
 """The paper's position RMSE by kind of task, of its vehicle alone."""
 PAPER_VEHICLE = "modcube"
@@ -152,6 +155,8 @@ def no_tag_reason(scenario: Scenario, whole: Flight) -> str:
         why = f"the vehicle {without[0]} carries none"
     else:
         why = f"no [[camera]] read a tag of tags = [{tags}]; position_m, axis and half_view_deg tell what it sees"
+        if kept := [fault.kind for fault in scenario.fault if fault.kind in KEEP_TAGS_AWAY]:
+            why += f"; or a [[fault]] kept it away: {', '.join(dict.fromkeys(kept))}"
     return f"no tag was ever seen, and without a pose the robot is not armed: {why}"
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from firmware_py.description.schema import DescriptionError
 from firmware_py.description.signals import Columns, read_signals
 from hil.truth_log import TRUTH_LOG
 
@@ -82,16 +83,16 @@ def read_flight(folder: Path) -> Flight:
     """The flight of the body that module 0 leads, from the logs in `folder`.
 
     Raises:
-        OSError: a log is missing. ValueError: a log lacks the body, or the logs share no tick.
+        OSError: a log is missing. DescriptionError: a log lacks the body, or the logs share no tick.
     """
     signals, truths = read_signals(folder / SIGNAL_LOG), read_signals(folder / TRUTH_LOG)
     if "/firmware/body0" not in signals or "/plant/body0" not in truths:
-        raise ValueError(f"{folder}: no signals or no truth of body 0 in the logs")
+        raise DescriptionError(f"{folder}: no signals or no truth of body 0 in the logs; was the firmware killed all the time?")
     firmware, thrusters = signals["/firmware/body0"], truths["/plant/module0"]["force_n"].shape[1]
     truth = _joined(truths)
     _, mine, theirs = np.intersect1d(firmware["tick"], truth["tick"], return_indices=True)
     if not len(mine):
-        raise ValueError(f"{folder}: the two logs share no tick")
+        raise DescriptionError(f"{folder}: the logs of firmware and plant share no tick, so there is nothing to judge")
     nothing: Columns = {name: np.zeros(0, np.int64) for name in ("tick", "severity", "log_time")} | {"text": np.zeros(0, str)}
     believed, true = rows_of(firmware, mine), rows_of(truth, theirs)
     _use_pose_of_steered_body(believed, true, thrusters)

@@ -113,6 +113,7 @@ def test_robot_that_never_armed_fails_where_nothing_else_is_checked(fly: Fly, de
         ({"camera": ()}, "modcube", "the scenario has no [[camera]]"),
         ({"camera": (CameraPose(axis=np.array([0.0, 0.0, -1.0])),)}, "modcube", "no [[camera]] read a tag of tags = [0, 1, 2, 3, 4, 5]; p"),
         ({}, "girona500", "the vehicle girona500 carries none"),
+        ({"fault": (Fault(kind="frame_loss", value=1.0),)}, "modcube", "; or a [[fault]] kept it away: frame_loss"),
     ],
 )
 def test_robot_that_no_camera_saw_is_said_to_lack_a_tag(
@@ -120,7 +121,14 @@ def test_robot_that_no_camera_saw_is_said_to_lack_a_tag(
 ) -> None:
     result = fly(dataclasses.replace(shortened("mobius-1", 1.0, settle_s=2.0), **changes).with_vehicle(vehicle))
     print_result(result)
-    assert f"no tag was ever seen, and without a pose the robot is not armed: {why}" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "no tag was ever seen, and without a pose the robot is not armed: " in said and why in said
+
+
+def test_flight_without_any_firmware_is_refused_in_one_line(fly: Fly) -> None:
+    killed = dataclasses.replace(shortened("hover", 0.5, settle_s=1.1), fault=(Fault(kind="process_killed"),))
+    with pytest.raises(DescriptionError, match="no signals or no truth of body 0 in the logs; was the"):
+        fly(killed)
 
 
 @pytest.mark.slow
