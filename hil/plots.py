@@ -126,7 +126,7 @@ def _once_placed(flight: Flight, values: np.ndarray) -> np.ndarray:
 def _once_steered(flight: Flight, values: np.ndarray) -> np.ndarray:
     """(k, ...) the values as floats, NaN before the firmware has a reference of its own: until it is armed, that is the estimate."""
     own = np.any(flight.firmware["setpoint_p_wb"] != flight.firmware["p_wb"], axis=1)
-    steered = np.logical_or.accumulate(own & flight.placed)
+    steered = np.logical_or.accumulate(own & flight.placed) & flight.placed
     return np.where(steered.reshape(-1, *[1] * (values.ndim - 1)), values, np.nan)
 
 

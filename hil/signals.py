@@ -56,9 +56,11 @@ class Flight:
 
     @property
     def placed(self) -> np.ndarray:
-        """(k,) whether tags have given heading and position by then. Before that, the firmware's estimate and set-point are not a pose."""
-        told = self.firmware["ready"] & (self.firmware["tag_age_ns"] < NO_TAG_NS)
-        return np.logical_or.accumulate(told)
+        """(k,) whether tags have given heading and position by then. Before that, also of a firmware that was restarted in flight, its
+        estimate and set-point are not a pose.
+        """
+        seen = self.firmware["tag_age_ns"] < NO_TAG_NS
+        return np.logical_or.accumulate(self.firmware["ready"] & seen) & seen
 
     def between(self, start_ns: int, end_ns: int) -> Flight:
         """The ticks with start <= time <= end."""
