@@ -121,17 +121,6 @@ def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:
         leaders = ", ".join(str(scenario.module[members[0]].number) for members in scenario.groups)
         what = f"{kind} steers and judges one body, and there are {len(counts)}, led by modules {leaders}"
         yield ("task", "kind"), f"{what}; give the modules one `body` number, or fly {' or '.join(SEVERAL_BODIES)}"
-    for i, module in enumerate(scenario.module):
-        if module.clamped and kind not in SEVERAL_BODIES:
-            what = f"{kind} judges how the body of module {module.number} moves, and a load cell would hold it in place"
-            yield ("module", i, "clamped"), f"{what}; leave it out, or fly {' or '.join(SEVERAL_BODIES)}"
-    for members in scenario.groups:
-        for m in members[1:]:
-            module, leader = scenario.module[m], scenario.module[members[0]]
-            for key in ("position_m", "euler_deg"):
-                if getattr(module, key).any():
-                    what = f"module {module.number} is docked to module {leader.number}, which places and turns the body"
-                    yield ("module", m, key), f"{what}; leave it out, or give the cell"
     if kind == "force" and not {1, 2} <= set(counts):
         found = ", ".join(map(str, counts))
         yield ("task", "kind"), f"force compares a module alone with two docked ones; the bodies here have {found} modules"
@@ -141,6 +130,25 @@ def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:
             yield ("module", members[0]), f"the body of module {leader} has as many modules as another, and force tells them apart by that"
         if not any(scenario.module[m].clamped for m in members):
             yield ("module", members[0]), f"no load cell holds the body of module {leader}, whose force is measured; clamped = true"
+
+
+def _in_clamps(scenario: Scenario) -> Iterator[Mistake]:
+    kind = scenario.task.kind
+    for i, module in enumerate(scenario.module):
+        if module.clamped and kind not in SEVERAL_BODIES:
+            what = f"{kind} judges how the body of module {module.number} moves, and a load cell would hold it in place"
+            yield ("module", i, "clamped"), f"{what}; leave it out, or fly {' or '.join(SEVERAL_BODIES)}"
+
+
+def _in_docked(scenario: Scenario) -> Iterator[Mistake]:
+    """Checks that of docked modules only the first has a pose."""
+    for members in scenario.groups:
+        for m in members[1:]:
+            module, leader = scenario.module[m], scenario.module[members[0]]
+            for key in ("position_m", "euler_deg"):
+                if getattr(module, key).any():
+                    what = f"module {module.number} is docked to module {leader.number}, which places and turns the body"
+                    yield ("module", m, key), f"{what}; leave it out, or give the cell"
 
 
 def _in_tank(scenario: Scenario) -> Iterator[Mistake]:
@@ -264,7 +272,7 @@ def _out_of_reach(check: Check) -> Iterator[tuple[str, str]]:
 
 
 RULES = (
-    _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_tank, _in_moves, _in_start, _in_mentions,
-    _in_faces, _in_tags, _in_faults, _in_checks,
+    _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_clamps, _in_docked, _in_tank, _in_moves, _in_start,
+    _in_mentions, _in_faces, _in_tags, _in_faults, _in_checks,
 )  # fmt: skip
 """In order of priority: the first mistake found is the one reported."""
