@@ -121,7 +121,7 @@ class Mcu:
         # A fresh half marked disarmed disarms both halves; a stale half is zeroed on its own.
         disarmed = any(fresh and not armed for fresh, armed in zip(live, self._armed, strict=True))
         allowed = [fresh and not disarmed and not self.stopped for fresh in live]
-        self._apply([*self._command] if all(allowed) else [u if allowed[i // 4] else 0.0 for i, u in enumerate(self._command)])
+        self._apply([u if allowed[i // 4] else 0.0 for i, u in enumerate(self._command)])
         truth = self._world.truth(self.module)
         gyro, accel, status = self._fast
         sample = (self._sensors.gyro(truth).tolist(), self._sensors.accel(truth).tolist())

@@ -40,6 +40,21 @@ class Joint(NamedTuple):
     other_face: int
 
 
+class Facing(NamedTuple):
+    """Two faces that face each other, as `contact.mating` returns them."""
+
+    face: float
+    other_face: float
+    gap_m: float
+    lateral_m: float
+    tilt: float
+    roll: float
+    """From the nearest quarter turn, rad."""
+    closing_m_s: float
+    fits: float
+    """1 for a probe and a drogue."""
+
+
 class Contact(NamedTuple):
     """First contact of a probe with a funnel."""
 
@@ -170,21 +185,24 @@ class Docks:
 
     def _pair(self, time_ns: int, i: int, j: int, modules: Modules, state: np.ndarray, verdict: Verdict) -> None:
         """Updates two modules of different bodies that are close: engagement, contact, release or lock."""
-        face_i, face_j, gap, lateral, tilt, roll, closing, fits = mating(modules, self.faces, state, i, j)
-        if not fits:
+        pair = Facing(*mating(modules, self.faces, state, i, j))
+        if not pair.fits:
             return
-        s, f_i, f_j = self.spec, int(face_i), int(face_j)
+        s, gap, lateral, tilt_deg = self.spec, pair.gap_m, pair.lateral_m, math.degrees(pair.tilt)
         if not self.gap_m + self.lateral_m <= gap + lateral:
             self.gap_m, self.lateral_m = gap, lateral
         near_by = math.exp(-max(0.0, gap) / s.engage_m - (lateral / s.engage_side_m) ** 2)
-        self._engaged[i, f_i], self._engaged[j, f_j] = max(self._engaged[i, f_i], near_by), max(self._engaged[j, f_j], near_by)
+        for m, face in ((i, int(pair.face)), (j, int(pair.other_face))):
+            self._engaged[m, face] = max(self._engaged[m, face], near_by)
         if not self.faces.inside[i, j]:
-            if gap <= s.probe_m and lateral <= s.mouth_m and math.degrees(tilt) <= s.funnel_deg:
-                self._meet(Contact(time_ns, i, j, lateral, closing, math.degrees(tilt), False))
+            if gap <= s.probe_m and lateral <= s.mouth_m and tilt_deg <= s.funnel_deg:
+                self._meet(Contact(time_ns, i, j, lateral, pair.closing_m_s, tilt_deg, False))
         elif gap > s.rearm_m or lateral > s.mouth_m:
             self._let_go(i, j)
-        elif closing > -OPENING_M_S and self._locks(gap, lateral, tilt, roll, f_i, f_j, i, j):
-            verdict.join.append(Joint(i, f_i, j, f_j))
+        else:
+            joint = Joint(i, int(pair.face), j, int(pair.other_face))
+            if pair.closing_m_s > -OPENING_M_S and self._locks(joint, pair):
+                verdict.join.append(joint)
 
     def _meet(self, contact: Contact) -> None:
         i, j, rule = contact.module, contact.other, self.jam_rule
@@ -197,17 +215,16 @@ class Docks:
     def _let_go(self, i: int, j: int) -> None:
         self.faces.inside[i, j] = self.faces.stop[i, j] = 0.0
 
-    def _locks(
-        self, gap: float, lateral: float, tilt: float, roll: float, f_i: int, f_j: int, i: int, j: int
-    ) -> bool:
-        s = self.spec
-        pull = 0.5 * (self.faces.coil[i, f_i] + self.faces.coil[j, f_j])
-        return (
-            self.faces.stop[i, j] == 0.0
+    def _locks(self, joint: Joint, pair: Facing) -> bool:
+        """Whether two faces are close enough to lock, with their magnets on and no jam between them."""
+        s, coil = self.spec, self.faces.coil
+        pull = 0.5 * (coil[joint.module, joint.face] + coil[joint.other, joint.other_face])
+        return bool(
+            self.faces.stop[joint.module, joint.other] == 0.0
             and pull > 2.0 * LEAST_HOLD
-            and abs(gap) <= s.lock_m
-            and lateral <= s.lock_m
-            and max(abs(tilt), abs(roll)) <= math.radians(s.lock_deg)
+            and abs(pair.gap_m) <= s.lock_m
+            and pair.lateral_m <= s.lock_m
+            and max(abs(pair.tilt), abs(pair.roll)) <= math.radians(s.lock_deg)
         )
 
 
