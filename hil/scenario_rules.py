@@ -272,7 +272,7 @@ def _out_of_reach(check: Check) -> Iterator[tuple[str, str]]:
 
 
 RULES = (
-    _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_clamps, _in_docked, _in_tank, _in_moves, _in_start,
-    _in_mentions, _in_faces, _in_tags, _in_faults, _in_checks,
+    _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_clamps, _in_docked, _in_tank, _in_moves,
+    _in_start, _in_mentions, _in_faces, _in_tags, _in_faults, _in_checks,
 )  # fmt: skip
 """In order of priority: the first mistake found is the one reported."""
