@@ -29,7 +29,7 @@ from firmware_py.description.vehicle import load_vehicle
 from firmware_py.runtime.disk import writing_to
 from hil.campaign_summary import Trial, summarise, table_of
 from hil.checks import Result
-from hil.flight import LOGS, fly_and_judge
+from hil.flight import LOGS, flown_of, fly_and_judge
 from hil.metrics import OUTCOMES
 from hil.plant.world_parameters import world_parameters
 from hil.replaceable import check_replaceable, created_folder, is_json_with
@@ -120,7 +120,8 @@ def run_campaign(
                 if progress is not None:
                     progress(sum(seed in file.trials for seed in seeds), len(seeds))
             trials = [file.trials[seed] for seed in sorted(seeds)]
-        summary = summarise(scenario.name, trials)
+        flown = flown_of(scenario, parameters)
+        summary = summarise(scenario.name, trials) | flown._asdict() | {"vehicles": list(flown.vehicles)}
         (out / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         (out / TABLE_FILE).write_text(table_of(trials), encoding="utf-8")
     return summary

@@ -37,6 +37,7 @@ def test_campaign_flies_every_seed_and_writes_what_it_returns(tmp_path: Path, mo
     assert counted == [(1, 3), (2, 3), (3, 3)]
     assert summary == json.loads((tmp_path / SUMMARY_FILE).read_text())
     assert summary["seeds"] == [5, 6, 7]
+    assert (summary["controller"], summary["vehicles"]) == ("modcube", ["modcube"])
     rows = (tmp_path / TABLE_FILE).read_text().splitlines()
     assert rows[0] == "seed,passed,outcome,position_rmse_m,nis_mean,duration_s,world.mass_factor"
     assert rows[1] == "5,1,passed,0.005,,40.0,1.05"
