@@ -35,6 +35,7 @@ _SETTLE_TICKS = 3
 _HOLD_TICKS = 100
 """Ticks from the request of a hold until it must be in force; ticks queued while the loop took the request count too."""
 _REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
+_ANOTHER = "the body is another one"
 _PRESENT = -1
 """DO_SET_MISSION_CURRENT's number for the current item."""
 
@@ -205,6 +206,13 @@ class MissionFlight:
         self._flight.arrivals_s = plan.arrivals_s
         self._system.ask(Action.TRACK, plan.trajectory)
 
+    def lose_body(self) -> None:
+        """Ends the flight of a body that has docked into another: it does not fly on when it is undocked."""
+        if self._flight is not None and self._flight.started_ns is None:
+            self._end_before_it_began(_ANOTHER)
+        elif self._flight is not None:
+            self._end(PAUSED)
+
     def hear(self, event: Event) -> None:
         """Takes an event; a refusal of TRACK ends the flight that waits for it."""
         if event.text.startswith("TRACK refused") and self._flight is not None and self._flight.started_ns is None:
@@ -232,8 +240,11 @@ class MissionFlight:
         if flight is None or flight.started_ns is not None:
             return
         reason = self._reason_to_abandon(flight)
-        if reason:
-            self._end_before_it_began(reason)
+        if not reason:
+            return
+        self._end_before_it_began(reason)
+        if reason == _ANOTHER and flight.arrivals_s:  # it has been asked to track a plan that was made for the body before it
+            self._system.ask(Action.SET_MODE, Mode.POSHOLD)
 
     def _end_before_it_began(self, reason: str) -> None:
         self._system.say(WARNING, f"flight ended before it began: {reason}")
@@ -247,7 +258,7 @@ class MissionFlight:
         if not s.armed:
             return "the vehicle is disarmed"
         if s.picture.members(s.body) != flight.members:
-            return "the body is another one"
+            return _ANOTHER
         if self._system.task_changes != flight.task_changes:
             return "paused, or something else was asked for"
         if mode == Mode.POSHOLD or (mode == Mode.AUTO and flight.arrivals_s):

@@ -100,6 +100,7 @@ class Services:
         self.commands.step(time_ns)
         self.logs.step()
         if not self.system.body_is_known:
+            self.flight.lose_body()
             return
         self.parameters.step()
         self.missions.step(time_ns)

@@ -148,6 +148,39 @@ def test_flight_that_is_being_planned_ends_when_the_body_becomes_another(parts: 
     assert client.texts.count("flight ended before it began: the body is another one") == 1
 
 
+@pytest.mark.parametrize("plan_first", [False, True])
+def test_body_that_becomes_another_as_it_is_to_track_its_plan_holds_instead(plan_first: bool) -> None:
+    """The request to track names the body by its number, which the body that it has joined may have as well."""
+    world = World(2)
+    client = world.client()
+    world.robot.state[1] = State.ARMED
+    job = planning(world, client)
+    steps = [lambda: come_back(world, job), world.robot.dock]
+    for step in steps if plan_first else steps[::-1]:
+        step()
+    world.run(5)
+    assert Action.TRACK in [r.action for r in world.robot.asked] and world.robot.mode[0] == Mode.POSHOLD
+    assert client.texts.count("flight ended before it began: the body is another one") == 1
+
+
+@pytest.mark.parametrize("ticks_before", [1, 20])
+def test_flight_that_a_dock_into_another_body_ended_is_not_begun_by_the_undock(ticks_before: int) -> None:
+    """Regression: asked for within two ticks of the dock, it was planned and flown when the body was its own again."""
+    world = World(2)
+    client, apart = world.client(), list(world.robot.bodies)
+    world.robot.state[1] = State.ARMED
+    world.run(1)
+    client.send("COMMAND_INT", 2, 1, 6, 192, 0, 0, -1, 1, 0, float("nan"), 302084010, 1201614000, -0.4)
+    world.run(ticks_before)
+    world.station.jobs()
+    world.robot.dock()
+    world.run(500)
+    assert client.texts.count("flight ended before it began: the body is another one") == 1
+    world.robot.bodies = apart
+    world.run(50)
+    assert world.station.jobs() == [] and world.robot.mode[1] == Mode.POSHOLD
+
+
 def test_mission_of_a_robot_that_was_part_of_another_meanwhile_is_not_complete_but_paused() -> None:
     world = World(2)
     client, apart = world.client(), list(world.robot.bodies)
