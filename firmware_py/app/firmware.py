@@ -66,8 +66,9 @@ class Firmware:
         inputs.prepared = self.worker.results()
         outputs = self.pipeline.step(inputs)
         for request in outputs.preparations:
-            job = partial(prepare, request, self.pipeline, self.vehicles, self.fleet.pitch_m)
-            self.worker.submit(job, wish_of(request, self.pipeline.bodies), first=isinstance(request, PartRequest))
+            kind, body = wish_of(request, self.pipeline.bodies)
+            job = partial(prepare, request, kind, self.pipeline, self.vehicles, self.fleet.pitch_m)
+            self.worker.submit(job, (kind, body), first=isinstance(request, PartRequest))
         return outputs
 
 

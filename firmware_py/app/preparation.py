@@ -14,6 +14,9 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
 from firmware_py.prepare.docking import plan_dock, plan_undock
 
+DONE_SINCE = {"dock": "they have docked since that was asked for", "undock": "they have parted since that was asked for"}
+"""Reason why a request that waited for the worker is not planned any more, by its kind."""
+
 
 def wish_of(request: DockRequest | PartRequest, bodies: Sequence[Body]) -> tuple[str, int | None]:
     """Key of a request for the worker: its kind, and the index of the body. A newer request with the same key replaces a waiting one."""
@@ -25,12 +28,15 @@ def wish_of(request: DockRequest | PartRequest, bodies: Sequence[Body]) -> tuple
     return what, None if body is None else body.index
 
 
-def prepare(request: DockRequest | PartRequest, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
+def prepare(request: DockRequest | PartRequest, kind: str, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
     """The plan for `request`, or the reason why there is none; never raises for an infeasible request.
 
     Args:
+        kind: that of `wish_of` when it was made. Repeated before its modules docked, a dock would otherwise be planned as their undock.
         vehicles: by fleet index.
     """
+    if not isinstance(request, PartRequest) and wish_of(request, pipeline.bodies)[0] != kind:
+        return Prepared(request, None, (), DONE_SINCE[kind])
     bodies = {module: body for body in pipeline.bodies for module in body.modules}
     if isinstance(request, PartRequest):
         return _prepare_part(request, bodies, pipeline, vehicles, pitch_m)

@@ -4,6 +4,7 @@ import threading
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 
 from firmware_py.app.firmware import Firmware, compose
@@ -120,3 +121,21 @@ def test_docks_asked_for_in_every_tick_hold_up_no_body_that_came_apart(trio: Fir
     done: list[Prepared] = [prepared for _ in range(5) for prepared in worker.finish()]
     assert [prepared.request for prepared in done] == [docks[0], docks[0], docks[3], DockRequest(2, 3, 0, 2)], "the second is of the part"
     assert done[1].refusal == "they are apart already"
+
+
+def three(pair: int) -> Fleet:
+    """Three modules, the first two in one body if `pair` is 0, else (-1) each a body of its own."""
+    cells = ([0, 0, 0], [0, 1, 0], [0, 0, 0])
+    return Fleet(module=tuple(Module(number=n, body=pair if n < 3 else -1, cell=np.array(cell)) for n, cell in enumerate(cells, 1)))
+
+
+@pytest.mark.parametrize(("before", "after"), [(-1, 0), (0, -1)])
+def test_dock_that_was_asked_for_twice_is_not_planned_as_the_undock_of_what_has_docked_meanwhile(before: int, after: int) -> None:
+    """Regression: the repetition waited for the worker until the modules had docked, and then parted them. The same for an undock."""
+    worker = Slow()
+    firmware = compose(three(before), Parameters(), worker=worker)
+    step(firmware, DockRequest(2, 3, 0, 3))
+    step(firmware, DockRequest(1, 3, 0, 2))
+    firmware.pipeline.formation = compose(three(after), Parameters()).pipeline.formation
+    _, (repeated,) = worker.finish(), worker.finish()
+    assert repeated.plan is None and repeated.refusal.endswith("since that was asked for")
