@@ -202,6 +202,9 @@ class DockingStage:
         if isinstance(plan, UndockPlan):
             whole = _body_of(plan.opens[0].module, estimates)
             holds = next(iter(self._still_closed(plan)), None)
+            newest = self._expected.get(whole)
+            if holds is not None and newest is not None and newest.target_module not in estimates[whole][0].modules:
+                return ANOTHER  # a dock, since then
             return "" if holds is None or whole in waiting else HOLDS.format(*sorted(modules_of(holds)))
         mine, others = (_body_of(module, estimates) for module in (plan.request.module, plan.request.target_module))
         if mine not in waiting:

@@ -51,6 +51,17 @@ def test_undock_under_way_goes_on_when_what_is_asked_for_meanwhile_is_refused(bo
     assert tank.shape == [(0, 1), (2,), (3,)]
 
 
+def test_undock_that_was_called_off_before_its_plan_came_does_not_part_a_body_that_is_to_dock() -> None:
+    """Regression: the plan of the undock found the body in DOCK, where it waited for that of the dock."""
+    tank = FaultyTank([(0, 0, 0), (1, 0, 0), (4, 0, 0)], each=2, delay=50)
+    tank.fly()
+    for action, wanted in ((Action.UNDOCK, DockRequest(1, 1, 0, 0)), (Action.HOLD, None), (Action.DOCK, DockRequest(1, 0, 2, 1))):
+        tank.run(0.1, Request(action, 0, wanted))
+    tank.run(2.0)
+    assert tank.when("undock refused: another was asked for") < tank.when("docking module 1 to 2")
+    assert tank.shape == [(0, 1), (2,)]
+
+
 @pytest.mark.parametrize(("ahead", "behind", "glides"), [(False, False, 1), (True, False, 0), (False, True, 1), (True, True, None)])
 def test_what_is_undocked_glides_to_no_third_body(ahead: bool, behind: bool, glides: int | None) -> None:
     """When a chain of three was taken apart, the middle one once glided away from the last and pressed against the first."""
