@@ -29,6 +29,17 @@ SEVERAL_BODIES = ("dock", "force")
 """Kinds of tasks that steer and judge every body; the others steer that of the first module alone."""
 IDLE_IN_TANK = {"box": ("radius_m", "depth_m"), "cylinder": ("size_m",)}
 """Keys by the kind of tank that does not have them."""
+TASK_KEYS = {
+    "hover": ("centre_m",),
+    "spiral": ("centre_m", "radius_m", "climb_m", "turns"),
+    "moebius": ("centre_m", "radius_m", "half_width_m", "turns"),
+    "lissajous": ("centre_m", "amplitude_m", "frequency", "turns", "yaw_turns", "roll_turns"),
+    "waypoints": ("file",),
+    "dock": (),
+    "force": ("stick",),
+    "mode": ("centre_m", "mode", "pilot_until_s", "ground_until_s"),
+}
+"""Keys that a task of each kind has besides kind, settle_s and duration_s; a dock with steps along the strip has those of moebius."""
 Mistake = tuple[tuple[str | int, ...], str]
 """Path of keys to the wrong entry, and the error message."""
 
@@ -45,6 +56,11 @@ def idle_keys(scenario: Scenario, given: Mapping[str, Any]) -> Iterator[Mistake]
     for key in IDLE_IN_TANK[kind]:
         if key in given["tank"]:
             yield ("tank", key), f"a tank of the kind {kind} has no {key}; leave it out, or give another kind"
+    kind = scenario.task.kind
+    on_strip = kind == "dock" and any(step.do.startswith("moebius") for step in scenario.step)
+    for key in given["task"]:
+        if key not in ("kind", "settle_s", "duration_s", *TASK_KEYS["moebius" if on_strip else kind]):
+            yield ("task", key), f"a task of the kind {kind} has no {key}; leave it out, or give another kind"
 
 
 def metric_names(scenario: Scenario) -> list[str]:
@@ -106,11 +122,8 @@ def _in_settling(scenario: Scenario) -> Iterator[Mistake]:
 
 def _in_file(scenario: Scenario) -> Iterator[Mistake]:
     """Checks only whether a file is given; the script, which plans the path, checks its contents."""
-    task = scenario.task
-    if task.kind == "waypoints" and not task.file:
+    if scenario.task.kind == "waypoints" and not scenario.task.file:
         yield ("task", "kind"), "waypoints flies a file, and there is none; give file"
-    if task.kind != "waypoints" and task.file:
-        yield ("task", "file"), f"a task of the kind {task.kind} flies no file; only waypoints does"
 
 
 def _in_bodies(scenario: Scenario) -> Iterator[Mistake]:

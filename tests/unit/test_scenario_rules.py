@@ -74,7 +74,10 @@ def load(tmp_path: Path) -> Load:
           for name, kind in (("hover", "hover"), ("polycube", "lissajous"), ("faults", "mode"))),
         *((name, "[task]", f"{ASIDE}\n[task]", f"task.kind: {kind} steers and judges one body, and there are 2, led by modules 1, 2; give")
           for name, kind in (("hover", "hover"), ("spiral", "spiral"), ("faults", "mode"))),
-        ("hover", 'kind = "hover"', 'kind = "force"', "force compares a module alone with two docked ones"),
+        (
+            "hover", 'kind = "hover"\nsettle_s = 15.0\nduration_s = 60.0\ncentre_m = [0.0, 0.0, 0.38]',
+            'kind = "force"\nsettle_s = 15.0\nduration_s = 60.0', "force compares a module alone with two docked ones",
+        ),
         ("polycube", "number = 1", "number = 25", "module[0].number: 25 and 7 more go up to 32; the bus has numbers to 29, so it is 22"),
         ("polycube", "[polycube]", "[[module]]\nnumber = 9\n[polycube]", "module[1]: a [polycube] takes the place of all modules"),
         ("hover", "[0.0, 0.0, 0.38]", "[0.0, 0.61, 0.38]", "[0.0, 0.61, 0.38] m is outside the tank, a box of 1.3 x 1.2 x 0.76 m"),
@@ -146,7 +149,10 @@ def load(tmp_path: Path) -> Load:
         ("mobius-1", 'kind = "cylinder"', 'kind = "box"', "tank.radius_m: a tank of the kind box has no radius_m; leave it out, or"),
         ("mobius-2", "cell = [1, 0, 0]", "cell = [1, 0, 0]\neuler_deg = [0, 0, 90]", "module[1].euler_deg: module 2 is docked to module 1"),
         ("hover", "", '[[step]]\ndo = "wait"', "step[0]: a task of the kind hover runs no steps"),
-        ("hover", 'kind = "hover"', 'kind = "hover"\nfile = "none.csv"', "task.file: a task of the kind hover flies no file"),
+        ("hover", 'kind = "hover"', 'kind = "hover"\nfile = "none.csv"', "task.file: a task of the kind hover has no file; leave it out"),
+        ("hover", 'kind = "hover"', 'kind = "hover"\nclimb_m = 0.4', "task.climb_m: a task of the kind hover has no climb_m; leave"),
+        ("dock", 'kind = "dock"', 'kind = "dock"\nturns = 2.0', "task.turns: a task of the kind dock has no turns"),
+        ("dock-mobius", 'kind = "dock"', 'kind = "dock"\nstick = 0.5', "task.stick: a task of the kind dock has no stick"),
         ("waypoints", 'file = "waypoints.csv"', "", "task.kind: waypoints flies a file, and there is none"),
         ("waypoints", 'file = "', 'file = "no-', "no-waypoints.csv: cannot be read: No such file or directory"),
         ("waypoints", 'file = "waypoints.csv"', 'file = "."', "cannot be read: Is a directory"),
