@@ -189,7 +189,10 @@ def test_what_only_lockstep_can_break_is_refused_in_real_time(
         assert line.count("\n") == 1
 
 
-NEAR = '[[module]]\nnumber = 2\nposition_m = [0.0, 0.1, 0.38]\n[[step]]\ndo = "wait"\n[task]\nkind = "dock"'
+TIMES = "settle_s = 15.0\nduration_s = 60.0"
+HOVER = f'[task]\nkind = "hover"\n{TIMES}\ncentre_m = [0.0, 0.0, 0.38]'
+NEAR = f'[[module]]\nnumber = 2\nposition_m = [0.0, 0.1, 0.38]\n[[step]]\ndo = "wait"\n[task]\nkind = "dock"\n{TIMES}'
+POINTS = f'[task]\nkind = "waypoints"\n{TIMES}\nfile = "points.csv"'
 NORTH = "x_m,y_m,z_m,duration_s\n0,0,0.38,\n0.1,north,0.38,5\n"
 
 
@@ -205,8 +208,8 @@ REALTIME = pytest.param(["--realtime", "--bus", "udp:239.74.163.9:43127"], marks
         ("", "", ["--vehicle", "no_mesh.toml"], "none.stl: there is no such mesh"),
         ("", "", ["--rate", "120"], "--rate 120"),
         ("", "", ["--bus", "socketcan:can9"], "there is no such interface"),
-        ('[task]\nkind = "hover"', NEAR, [], "modules 1 and 2 start 0.1 m apart, one inside the other"),
-        ('kind = "hover"', 'kind = "waypoints"\nfile = "points.csv"', [], "points.csv:3: y_m: 'north' is not a number"),
+        (HOVER, NEAR, [], "modules 1 and 2 start 0.1 m apart, one inside the other"),
+        (HOVER, POINTS, [], "points.csv:3: y_m: 'north' is not a number"),
     ],
     ids=["vehicle", "large", "mesh", "rate", "bus", "overlap", "waypoints"],
 )
