@@ -35,9 +35,10 @@ def prepare(request: DockRequest | PartRequest, kind: str, pipeline: Pipeline, v
         kind: that of `wish_of` when it was made. Repeated before its modules docked, a dock would otherwise be planned as their undock.
         vehicles: by fleet index.
     """
-    if not isinstance(request, PartRequest) and wish_of(request, pipeline.bodies)[0] != kind:
+    present = pipeline.bodies  # once: the loop runs meanwhile, and may join or part them
+    if not isinstance(request, PartRequest) and wish_of(request, present)[0] != kind:
         return Prepared(request, None, (), DONE_SINCE[kind])
-    bodies = {module: body for body in pipeline.bodies for module in body.modules}
+    bodies = {module: body for body in present for module in body.modules}
     if isinstance(request, PartRequest):
         return _prepare_part(request, bodies, pipeline, vehicles, pitch_m)
     return _prepare_dock(request, bodies, pipeline, vehicles, pitch_m)

@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 from firmware_py.app.firmware import Firmware, compose
+from firmware_py.app.preparation import prepare
 from firmware_py.app.replay import DueWorker
+from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Prepared
+from firmware_py.core.docking_sequence import UndockPlan
+from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.types import DockRequest, Inputs, ModuleInputs, Outputs, PartRequest
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import PITCH_M
 from firmware_py.runtime.worker import InlineWorker, Job, ThreadWorker, Worker
 
 
@@ -139,3 +145,19 @@ def test_dock_that_was_asked_for_twice_is_not_planned_as_the_undock_of_what_has_
     firmware.pipeline.formation = compose(three(after), Parameters()).pipeline.formation
     _, (repeated,) = worker.finish(), worker.finish()
     assert repeated.plan is None and repeated.refusal.endswith("since that was asked for")
+
+
+def test_dock_whose_modules_dock_while_its_planning_begins_is_not_planned_as_their_undock() -> None:
+    """The worker reads the bodies while the loop runs on, which may join them between two reads."""
+    apart, docked = (compose(three(pair), Parameters()).pipeline for pair in (-1, 0))
+
+    class Joining(Pipeline):
+        @property
+        def bodies(self) -> list[Body]:
+            bodies = self.formation.bodies
+            self.formation = docked.formation
+            return bodies
+
+    apart.__class__ = Joining
+    prepared = prepare(DockRequest(1, 3, 0, 2), "dock", apart, [load_vehicle("modcube")] * 3, PITCH_M)
+    assert not isinstance(prepared.plan, UndockPlan), prepared
