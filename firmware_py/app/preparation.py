@@ -14,8 +14,9 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import Vehicle
 from firmware_py.prepare.docking import plan_dock, plan_undock
 
-DONE_SINCE = {"dock": "they have docked since that was asked for", "undock": "they have parted since that was asked for"}
-"""Reason why a request that waited for the worker is not planned any more, by its kind."""
+DONE_SINCE = {"dock": "a dock was asked for, and they have docked since", "undock": "an undock was asked for, and they have parted since"}
+"""Reason why a request that waited for the worker is not planned any more, by its kind. By now it would be of the other kind, which the
+event names."""
 
 
 def wish_of(request: DockRequest | PartRequest, bodies: Sequence[Body]) -> tuple[str, int | None]:

@@ -135,8 +135,10 @@ def three(pair: int) -> Fleet:
     return Fleet(module=tuple(Module(number=n, body=pair if n < 3 else -1, cell=np.array(cell)) for n, cell in enumerate(cells, 1)))
 
 
-@pytest.mark.parametrize(("before", "after"), [(-1, 0), (0, -1)])
-def test_dock_that_was_asked_for_twice_is_not_planned_as_the_undock_of_what_has_docked_meanwhile(before: int, after: int) -> None:
+@pytest.mark.parametrize(("before", "after", "asked"), [(-1, 0, "a dock"), (0, -1, "an undock")])
+def test_dock_that_was_asked_for_twice_is_not_planned_as_the_undock_of_what_has_docked_meanwhile(
+    before: int, after: int, asked: str
+) -> None:
     """Regression: the repetition waited for the worker until the modules had docked, and then parted them. The same for an undock."""
     worker = Slow()
     firmware = compose(three(before), Parameters(), worker=worker)
@@ -144,7 +146,7 @@ def test_dock_that_was_asked_for_twice_is_not_planned_as_the_undock_of_what_has_
     step(firmware, DockRequest(1, 3, 0, 2))
     firmware.pipeline.formation = compose(three(after), Parameters()).pipeline.formation
     _, (repeated,) = worker.finish(), worker.finish()
-    assert repeated.plan is None and repeated.refusal.endswith("since that was asked for")
+    assert repeated.plan is None and repeated.refusal.startswith(f"{asked} was asked for, and they have ")
 
 
 def test_dock_whose_modules_dock_while_its_planning_begins_is_not_planned_as_their_undock() -> None:
