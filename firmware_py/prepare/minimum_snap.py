@@ -185,7 +185,7 @@ def _first_feasible(request: _Request, base: np.ndarray, both_ways: bool) -> tup
     """The first feasible stretch of `base` out of 1, 2, 4, ..., or out of 1, 2, 1/2, 4, 1/4, ..., and its trajectory."""
     factor = 1.0
     while factor <= _LONGEST_STRETCH:
-        for tried in (factor, 1.0 / factor) if both_ways else (factor,):
+        for tried in (factor, 1.0 / factor) if both_ways and factor > 1.0 else (factor,):
             if (found := request.try_stretch(base, tried)) is not None:
                 return tried, found
         factor *= 2.0

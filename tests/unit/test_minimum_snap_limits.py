@@ -12,7 +12,7 @@ import pytest
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
 from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare import snap_limits
+from firmware_py.prepare import minimum_snap, snap_limits
 from firmware_py.prepare.assembly import assemble_vehicle
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, plan
 from firmware_py.prepare.piecewise import Piecewise
@@ -158,6 +158,20 @@ def test_free_durations_are_found_though_a_given_velocity_bounds_them_from_above
     found = plan(waypoints, limits=limits)
     assert found.duration_s < 5.0
     assert extremes(found)[1].max() == pytest.approx(2.0, rel=5e-3)
+
+
+def test_search_for_free_durations_past_a_given_velocity_tries_none_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A try takes seconds where there are many waypoints."""
+    waypoints = [Waypoint(np.zeros(3)), Waypoint(np.eye(3)[0], velocity_w=1.5 * np.eye(3)[0]), Waypoint(2.0 * np.eye(3)[0])]
+    tried, try_stretch = list[float](), minimum_snap._Request.try_stretch
+
+    def noted(request: minimum_snap._Request, base: np.ndarray, factor: float) -> Piecewise | None:
+        tried.append(factor)
+        return try_stretch(request, base, factor)
+
+    monkeypatch.setattr(minimum_snap._Request, "try_stretch", noted)
+    plan(waypoints, limits=Limits(acceleration=np.full(3, 2.0), corridor_m=0.02))
+    assert tried[:3] == [1.0, 2.0, 0.5] and len(set(tried)) == len(tried)
 
 
 STOPS = [Waypoint(np.array(p, dtype=float), stop=True) for p in ((0, 0, 0), (1, 0, 0), (1, 1, 0))]
