@@ -257,10 +257,10 @@ class MissionFlight:
         flight.hold_reached = flight.hold_reached or mode == Mode.POSHOLD
         if not s.armed:
             return "the vehicle is disarmed"
-        if s.picture.members(s.body) != flight.members:
-            return _ANOTHER
         if self._system.task_changes != flight.task_changes:
             return "paused, or something else was asked for"
+        if s.picture.members(s.body) != flight.members:
+            return _ANOTHER
         if mode == Mode.POSHOLD or (mode == Mode.AUTO and flight.arrivals_s):
             return ""
         return f"the mode is {mode.name}" if flight.hold_reached or s.picture.ticks > self._hold_by_tick else ""

@@ -163,6 +163,19 @@ def test_body_that_becomes_another_as_it_is_to_track_its_plan_holds_instead(plan
     assert client.texts.count("flight ended before it began: the body is another one") == 1
 
 
+def test_body_that_becomes_another_as_the_pilot_takes_it_stays_with_the_pilot() -> None:
+    """The hold that is to end the tracking of the old body's plan came after the pilot's mode."""
+    world = World(2)
+    client = world.client()
+    world.robot.state[1] = State.ARMED
+    come_back(world, planning(world, client))
+    client.send("COMMAND_LONG", 1, 1, 176, 0, 1.0, 1.0, 0, 0, 0, 0, 0)
+    world.robot.dock()
+    world.run(5)
+    assert world.robot.mode[0] == Mode.MANUAL
+    assert client.texts.count("flight ended before it began: paused, or something else was asked for") == 1
+
+
 @pytest.mark.parametrize("ticks_before", [1, 20])
 def test_flight_that_a_dock_into_another_body_ended_is_not_begun_by_the_undock(ticks_before: int) -> None:
     """Regression: asked for within two ticks of the dock, it was planned and flown when the body was its own again."""
