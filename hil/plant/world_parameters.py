@@ -23,12 +23,15 @@ def world_parameters(vehicles: Sequence[Vehicle], spec: WorldSpec, seed: int) ->
 def _module_parameters(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> dict[str, float]:
     draw, nominal = draw_module(vehicle, spec, seed, module), vehicle.inertial
     drag = vehicle.drag
+    published = drag.quadratic[:3]
     return {
         "mass_factor": draw.dry_kg / nominal.dry_kg,
         "added_mass_factor": _factor(draw.added[:3], nominal.added[:3]),
         "inertia_factor": _factor(np.diag(draw.inertia), np.diag(nominal.inertia)),
-        "drag_face_factor": _factor(draw.drag[:1], np.array([drag.cd_face])),
-        "drag_edge_factor": _factor(draw.drag[1:2], np.array([drag.cd_edge])),
+        "drag_face_factor": _factor(
+            np.r_[draw.drag[0], draw.linear[:3], draw.quadratic[: published.size]], np.r_[drag.cd_face, drag.linear[:3], published]
+        ),
+        "drag_edge_factor": 1.0 if published.size else _factor(draw.drag[1:2], np.array([drag.cd_edge])),
         "thruster_gain_mean": float(draw.gain.mean()),
         "thruster_gain_spread": float(draw.gain.std()),
         "deadband_n": float(draw.deadband_n.mean()),

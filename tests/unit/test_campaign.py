@@ -1,5 +1,6 @@
 """Many seeds of one scenario: each is flown once, and finished trials are kept."""
 
+import dataclasses
 import json
 from importlib import resources
 from pathlib import Path
@@ -11,6 +12,8 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
 from hil.campaign import SUMMARY_FILE, TABLE_FILE, TRIALS_FILE, fly_trial, identity, outcome_of, run_campaign
 from hil.checks import Check, Result
+from hil.plant.draw import draw_module
+from hil.plant.spec import WorldSpec
 from hil.plant.world_parameters import world_parameters
 from hil.scenario import load_scenario
 from hil.trial_file import TrialFile
@@ -150,3 +153,12 @@ def test_world_of_a_seed_is_named_in_numbers_and_a_calm_one_is_what_the_file_say
     )
     assert quiet["trim_m"] == quiet["current_north_m_s"] == quiet["net_buoyancy_n"] == 0.0
     assert quiet["righting_arm_m"] == pytest.approx(0.005)
+
+
+def test_drag_drawn_for_a_vehicle_with_published_damping_is_named_whatever_its_idle_coefficients() -> None:
+    vehicle = load_vehicle("bluerov2")
+    idle = dataclasses.replace(vehicle, drag=dataclasses.replace(vehicle.drag, cd_face=0.0, cd_edge=0.0))
+    drawn = draw_module(vehicle, WorldSpec(), 1, 0).quadratic[0] / vehicle.drag.quadratic[0]
+    for each in (vehicle, idle):
+        named = world_parameters([each], WorldSpec(), 1)
+        assert named["drag_face_factor"] == pytest.approx(drawn) and named["drag_edge_factor"] == 1.0
