@@ -164,7 +164,7 @@ class DockRequest(NamedTuple):
     target_module: int
     target_face: int
     quarter_turns: int = 0
-    """Rotation of the active face about its normal against the target's, 0 to 3."""
+    """Of the active module about the normal of the target's face, from the seat that turns it least, 0 to 3."""
     both_approach: bool = False
     """Both bodies move, as in the paper."""
 
