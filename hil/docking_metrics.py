@@ -25,7 +25,8 @@ DECLARED = STAGES.index("docked")
 FACING = math.cos(math.radians(30.0))
 """Least cosine between the normals of mated faces and the line from centre to centre: 30 deg, a third of a quarter turn."""
 AS_TURNED = 0.1
-"""Tolerance of the cosine of half an angle by which one of four seats, a quarter turn apart, counts as that of the least angle."""
+"""Tolerance of the cosine of half an angle by which one of four seats counts as that of the least angle: a third of 0.29, by which that of
+no angle and that of a quarter turn differ."""
 UNSTABLE_RAD, KEPT_UP_TICKS = math.radians(30.0), 200
 """A body whose attitude stays this far from its set-point, for this many ticks, is out of control."""
 

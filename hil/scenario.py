@@ -317,7 +317,7 @@ def load_scenario(name: str) -> Scenario:
     table, source = read_toml(path)
     scenario: Scenario = build(Scenario, table, source)
     scenario = dataclasses.replace(scenario, module=find_vehicles(scenario.module, source))
-    for mistake in itertools.chain(idle_keys(scenario, table), mistakes(scenario)):
+    if (mistake := next(itertools.chain(idle_keys(scenario, table), mistakes(scenario)), None)) is not None:
         raise source.error(*mistake)
     return _with_file_text(scenario, path.parent, source)
 

@@ -27,19 +27,20 @@ YAWS = 37
 """Number of headings checked over the range that a seed may draw: at most 10 deg apart."""
 SEVERAL_BODIES = ("dock", "force")
 """Kinds of tasks that steer and judge every body; the others steer that of the first module alone."""
-IDLE_IN_TANK = {"box": ("radius_m", "depth_m"), "cylinder": ("size_m",)}
-"""Keys by the kind of tank that does not have them."""
-TASK_KEYS = {
-    "hover": ("centre_m",),
-    "spiral": ("centre_m", "radius_m", "climb_m", "turns"),
-    "moebius": ("centre_m", "radius_m", "half_width_m", "turns"),
-    "lissajous": ("centre_m", "amplitude_m", "frequency", "turns", "yaw_turns", "roll_turns"),
-    "waypoints": ("file",),
-    "dock": (),
-    "force": ("stick",),
-    "mode": ("centre_m", "mode", "pilot_until_s", "ground_until_s"),
+OWN_KEYS = {
+    "tank": {"box": ("size_m",), "cylinder": ("radius_m", "depth_m")},
+    "task": {
+        "hover": ("centre_m",),
+        "spiral": ("centre_m", "radius_m", "climb_m", "turns"),
+        "moebius": ("centre_m", "radius_m", "half_width_m", "turns"),
+        "lissajous": ("centre_m", "amplitude_m", "frequency", "turns", "yaw_turns", "roll_turns"),
+        "waypoints": ("file",),
+        "dock": (),
+        "force": ("stick",),
+        "mode": ("centre_m", "mode", "pilot_until_s", "ground_until_s"),
+    },
 }
-"""Keys that a task of each kind has besides kind, settle_s and duration_s; a dock with steps along the strip has those of moebius."""
+"""Keys that not every kind of a table has, by kind; a dock with steps along the strip has those of moebius."""
 Mistake = tuple[tuple[str | int, ...], str]
 """Path of keys to the wrong entry, and the error message."""
 
@@ -52,15 +53,14 @@ def mistakes(scenario: Scenario) -> Iterator[Mistake]:
 
 def idle_keys(scenario: Scenario, given: Mapping[str, Any]) -> Iterator[Mistake]:
     """Yields the keys `given` in its file that have no effect in the scenario."""
-    kind = scenario.tank.kind
-    for key in IDLE_IN_TANK[kind]:
-        if key in given["tank"]:
-            yield ("tank", key), f"a tank of the kind {kind} has no {key}; leave it out, or give another kind"
-    kind = scenario.task.kind
-    on_strip = kind == "dock" and any(step.do.startswith("moebius") for step in scenario.step)
-    for key in given["task"]:
-        if key not in ("kind", "settle_s", "duration_s", *TASK_KEYS["moebius" if on_strip else kind]):
-            yield ("task", key), f"a task of the kind {kind} has no {key}; leave it out, or give another kind"
+    on_strip = scenario.task.kind == "dock" and any(step.do.startswith("moebius") for step in scenario.step)
+    for table, kind, has in (
+        ("tank", scenario.tank.kind, scenario.tank.kind), ("task", scenario.task.kind, "moebius" if on_strip else scenario.task.kind)
+    ):  # fmt: skip
+        idle = set(itertools.chain(*OWN_KEYS[table].values())).difference(OWN_KEYS[table][has])
+        for key in given[table]:
+            if key in idle:
+                yield (table, key), f"a {table} of the kind {kind} has no {key}; leave it out, or give another kind"
 
 
 def metric_names(scenario: Scenario) -> list[str]:

@@ -32,7 +32,8 @@ LEAST_SLOPE = 1e-3
 LEAST_POINTS = 6
 """Required on either side, beyond the deadband."""
 LOST = 10.0
-"""Force at a smaller command, as a multiple of --zero, above which a reading of zero is a lost one and no deadband."""
+"""Force at a smaller command, as a multiple of --zero, above which a reading of zero is a lost one and no deadband: noise
+of a load cell does not come near it (synthetic)."""
 COLUMNS = ("command", "force_n")
 OPTIONAL = ("voltage_v", "power_w")
 MOST = 1e6

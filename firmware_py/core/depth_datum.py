@@ -38,7 +38,7 @@ class DepthDatum:
     def __init__(self) -> None:
         self._readings: deque[tuple[int, float]] = deque(maxlen=READINGS)
         self._offsets = np.full(PICTURES, np.nan)
-        """By the latest pictures, oldest first; NaN until there are as many."""
+        """(PICTURES,) m, by the latest pictures, oldest first; NaN until there are as many."""
         self._usual_m = math.nan
         self.shift_m = self._change_m = math.nan
         """Present offset less the usual one, and change of the offset within the pictures kept, m; NaN until known."""
@@ -62,7 +62,8 @@ class DepthDatum:
         told_m = self._told_at(capture_ns)
         if math.isnan(told_m):
             return
-        earlier_m, later_m, present_m = append(self._offsets, told_m - depth_m)
+        offset_m = told_m - depth_m
+        earlier_m, later_m, present_m = append(self._offsets, offset_m)
         if math.isnan(earlier_m):
             return
         self._change_m = later_m - earlier_m
@@ -70,7 +71,7 @@ class DepthDatum:
             self._usual_m = 0.5 * (earlier_m + later_m)
         self.shift_m = present_m - self._usual_m
         if not self.errs:
-            self._usual_m += (told_m - depth_m - self._usual_m) / USUAL_OF
+            self._usual_m += (offset_m - self._usual_m) / USUAL_OF
 
     def take_as_usual(self) -> None:
         """Counts the present offset as the usual one, if both are known."""
@@ -97,7 +98,10 @@ class DepthDatum:
 
 @njit(f"UniTuple(float64,3)({V},float64)", cache=True)
 def append(offsets, newest):  # type: ignore[no-untyped-def]
-    """Appends an offset (m) and drops the oldest. Returns the means of the earlier half, of the later half and of the LATEST."""
+    """Appends `newest`, m, to `offsets` (PICTURES,), m, which lose their oldest.
+
+    Returns the means of the earlier half, of the later half and of the LATEST, m; NaN where they have one.
+    """
     offsets[:-1] = offsets[1:]
     offsets[-1] = newest
     return offsets[: PICTURES // 2].mean(), offsets[PICTURES // 2 :].mean(), offsets[PICTURES - LATEST :].mean()
@@ -105,5 +109,5 @@ def append(offsets, newest):  # type: ignore[no-untyped-def]
 
 @njit(f"float64({V})", cache=True)
 def median_step(offsets):  # type: ignore[no-untyped-def]
-    """Median change from one offset (m) to the next; NaN while there are too few."""
+    """Median change, m, from one of `offsets` (PICTURES,), m, to the next; NaN while there are too few."""
     return np.median(np.abs(np.diff(offsets)))

@@ -67,7 +67,7 @@ class _ModuleWatch:
 
     def __init__(self) -> None:
         self._memory = (*(np.full(7, np.nan) for _ in range(3)), np.zeros(7, dtype=np.int64))
-        """What `judge` remembers."""
+        """What `judge` remembers: its arguments from `sound` on, four arrays (7,)."""
 
     def step(self, module: ModuleInputs) -> ModuleInputs:
         """The module's inputs without implausible samples."""

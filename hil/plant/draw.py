@@ -88,7 +88,7 @@ def draw_module(vehicle: Vehicle, spec: WorldSpec, seed: int, module: int) -> Mo
     arm = inertial.righting_arm_m + spec.righting_spread_m * stream(seed, "righting", module).uniform(-1.0, 1.0)
     shift = np.append(spec.trim_m * stream(seed, "trim", module).uniform(-1.0, 1.0, 2), 0.0)
     drag, factor = vehicle.drag, spread("drag", spec.drag_spread, 5)
-    damping = factor[[0, 0, 0, 2, 3, 4]]
+    damping = factor[[0, 0, 0, 2, 3, 4]]  # along each axis as face-on, about each as its rotation
     root = np.sqrt(turn[:3])
     deadband = spec.deadband_low_n + (spec.deadband_high_n - spec.deadband_low_n) * stream(
         seed, "deadband", module
