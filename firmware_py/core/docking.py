@@ -100,6 +100,11 @@ class DockingStage:
         """Whether any dock or undock is under way."""
         return bool(self._docks or self._undocks)
 
+    @property
+    def pairs(self) -> list[tuple[int, int]]:
+        """Numbers of the active body and the target of each dock under way."""
+        return [(dock.active, dock.target) for dock in self._docks]
+
     def forget(self, bodies: Collection[int]) -> Decisions:
         """Ends every dock in which one of `bodies`, which no longer exist, takes part; a target that was coming goes back."""
         self._expected = {body: request for body, request in self._expected.items() if body not in bodies}

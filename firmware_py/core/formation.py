@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from firmware_py.core.body import Body
+from firmware_py.core.collision import times_to_collision
 from firmware_py.core.docking import DockingStage
 from firmware_py.core.docking_decisions import Decisions, Join, Part
 from firmware_py.core.docking_pairs import APART, LOOSE
@@ -70,6 +71,12 @@ class Formation:
         for parted in decisions.parts:
             self._part(parted, inputs.time_ns, estimates)
         outputs.events += self.docking.events
+
+    def watch_distances(self, estimates: dict[int, Estimate]) -> None:
+        """Tells each body's health in which time it reaches another. Docks and undocks have their own right of way."""
+        times_s = times_to_collision(self.bodies, estimates, self.docking.pairs)
+        for pipeline in self.pipelines:
+            pipeline.health.collision_s = times_s[pipeline.body.index]
 
     def asked(self, pipeline: BodyPipeline, granted: Sequence[DockRequest]) -> list[DockRequest | PartRequest]:
         """Preparations needed for the docks and undocks of a body that were granted in this tick."""

@@ -89,6 +89,8 @@ class Health(NamedTuple):
     """Speed of the current that would explain the estimated horizontal disturbance force; RMS over a second."""
     esc_unknown: tuple[Place, ...] = ()
     """Places without a thruster by the vehicle file from which an ESC answers."""
+    collision_s: float = math.nan
+    """Time in which the body reaches another that it moves towards (core.collision); NaN if there is none."""
     without_thrust: tuple[str, ...] = ()
     """Axes that no thruster of the body can push although the vehicle does not declare them passive."""
 

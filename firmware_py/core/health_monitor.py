@@ -88,6 +88,8 @@ class HealthMonitor:
         """The same for a pressure sensor."""
         self.topology, self.open_joints = "", tuple[frozenset[int], ...]()
         """Set by the code that watches the docked faces."""
+        self.collision_s = math.nan
+        """Set by the code that compares the motions of all bodies."""
         self.warm = False
         """Set by the pipeline once every stage has run: from then on nothing is compiled or read from disk in a tick."""
         self.retune(parameters)
@@ -175,6 +177,7 @@ class HealthMonitor:
             cabin_age_s=(now - min(self._cabin_ns.values())) * 1e-9,
             push_m_s=math.sqrt(latest.push_m2_s2),
             esc_unknown=tuple([at for at, ns in self._unknown_esc_ns.items() if now - ns <= self._esc_fresh_ns]),
+            collision_s=self.collision_s,
             without_thrust=self._without_thrust,
         )
 

@@ -175,6 +175,14 @@ class Failsafes:
     fence_delay_s: float = delay(0.2, "FS_FENC_S")
     fence_action: int = action(2, "FS_FENC_ACT")
     fence_latched: int = latched(0, "FS_FENC_LAT")
+    # another body is in the way; docks and undocks give way by themselves
+    collision_limit: float = quantity(
+        0.5, unit="s", low=0, high=60,
+        help="least permitted time in which the body would reach another one towards which it moves", mavlink="FS_COL_LIM"
+    )
+    collision_delay_s: float = delay(0.1, "FS_COL_S")
+    collision_action: int = action(2, "FS_COL_ACT")
+    collision_latched: int = latched(0, "FS_COL_LAT")
     # ground station lost
     ground_lost_limit: float = quantity(
         5.0, unit="s", low=0.5, high=600, help="longest permitted silence of the ground station", mavlink="FS_GCS_LIM"

@@ -18,7 +18,8 @@ FIELDS: dict[str, str] = {
     "tag_gone": "tag_age_s", "partner_lost": "topology", "estimator": "nis_ratio", "rejected": "rejected_share",
     "tag_lost": "tag_age_s", "pushed": "push_m_s", "tag_late": "tag_age_s",
     "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s",
-    "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "ground_lost": "ground_age_s", "pilot_lost": "pilot_age_s",
+    "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "collision": "collision_s", "ground_lost": "ground_age_s",
+    "pilot_lost": "pilot_age_s",
     "thruster_lost": "dead", "cabin_unknown": "cabin_age_s", "battery_unknown": "battery_age_s", "battery_low": "voltage_share",
 }  # fmt: skip
 """Field of Health that each fail-safe judges; depth_unknown and pushed judge two (see `spoilt`)."""

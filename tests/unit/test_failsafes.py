@@ -82,6 +82,7 @@ COUNTS = {
     "pushed": POSE_MODES - {Mode.DOCK},
     "tag_late": POSE_MODES - {Mode.POSHOLD},
     "fence": POSE_MODES - {Mode.POSHOLD},
+    "collision": {Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.ALT_HOLD, Mode.STABILIZE, Mode.MANUAL},
     "ground_lost": set(Mode) - {Mode.AUTO, Mode.SURFACE},
     "pilot_lost": {Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD},
 }
@@ -102,8 +103,12 @@ def test_mode_that_a_fail_safe_chose_is_left_when_tags_do_not_come_back(name: st
 
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("mode", Mode, ids=lambda mode: mode.name)
-def test_pilot_who_flies_by_the_estimate_is_only_told_that_it_contradicts_the_tags(name: str, mode: Mode) -> None:
-    only_warns = name in ("estimator", "rejected") and mode in (Mode.ALT_HOLD, Mode.STABILIZE)
+def test_pilot_is_only_told_of_what_he_may_judge_himself(name: str, mode: Mode) -> None:
+    """That the estimate contradicts the tags, in modes that use it; that another body is in his way."""
+    only_warns = mode in {
+        "estimator": (Mode.ALT_HOLD, Mode.STABILIZE), "rejected": (Mode.ALT_HOLD, Mode.STABILIZE),
+        "collision": (Mode.ALT_HOLD, Mode.STABILIZE, Mode.MANUAL),
+    }.get(name, ())  # fmt: skip
     for action in Level:
         wanted = replace(quick(name), **{f"{name}_action": int(action)})
         for alarm in alarms_of(wanted, bad(name), mode):
@@ -223,6 +228,7 @@ WORDS = {
     "module_silent": "a module is silent for 0.5 s",
     "ticks_missed": "ticks missed: 5 in a second",
     "fence": "outside the fence by 0.00 m",
+    "collision": "another body is in the way: 0.5 s",
     "ground_lost": "ground station silent for 5.0 s",
     "pilot_lost": "pilot silent for 1.0 s",
     "thruster_lost": "a thruster is out",

@@ -1,0 +1,146 @@
+"""Two bodies in each other's way: the time to their collision, and that they stop before it."""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from firmware_py.core.body import Body
+from firmware_py.core.collision import CLOSING_M_S, times_to_collision
+from firmware_py.core.rotations import from_euler
+from firmware_py.core.types import NEVER_AGE_NS, Action, Estimate, Mode, Request, Setpoint
+from firmware_py.description.parameters import Parameters
+from firmware_py.prepare.assembly import PITCH_M, assemble, assemble_vehicle
+from tests.unit.tanks import MODCUBE, FaultyTank
+
+EDGE_M = float(MODCUBE.hull.size_m[0])
+TOUCH_M = EDGE_M * 2.0**0.5
+"""Distance of the centres of two level cubes at which their corners can touch first."""
+ZERO, LEVEL = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def single(number: int) -> Body:
+    return assemble([(0, 0, 0)], [0], [MODCUBE], [number])
+
+
+def at(place: Sequence[float], velocity: Sequence[float] = (0.0, 0.0, 0.0), turn: float = 0.0, **changes: object) -> Estimate:
+    """A level body; `turn`: rad/s about the vertical."""
+    here = Estimate(np.array(place), LEVEL, np.array([*velocity, 0.0, 0.0, turn]), ZERO, ZERO, ZERO, ZERO, 0, math.nan, 0, 0, True)
+    return here._replace(**changes)
+
+
+def pair(first: Estimate, second: Estimate, docking: tuple[tuple[int, int], ...] = ()) -> tuple[float, float]:
+    bodies = [single(0), single(5)]
+    return tuple(times_to_collision(bodies, {0: first, 5: second}, docking).values())  # type: ignore[return-value]
+
+
+def test_radius_is_that_of_the_circle_about_the_level_hull() -> None:
+    assert single(0).radius_m == pytest.approx([0.5 * TOUCH_M])
+
+
+def test_time_is_the_gap_over_the_closing_speed() -> None:
+    moving, waiting = pair(at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0]))
+    assert moving == pytest.approx((1.0 - TOUCH_M) / 0.2, rel=1e-9)
+    assert math.isnan(waiting), "it does not move"
+    both = pair(at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0], [-0.3, 0.0, 0.0]))
+    assert both == pytest.approx([(1.0 - TOUCH_M) / 0.5] * 2, rel=1e-9)
+
+
+def test_time_off_the_straight_line_is_that_of_small_steps() -> None:
+    """Against a march in steps of 10 us."""
+    v, d = np.array([0.31, 0.12, -0.07]), np.array([0.9, 0.2, -0.15])
+    t = np.arange(0.0, 5.0, 1e-5)
+    first = t[np.flatnonzero(np.linalg.norm(d - t[:, None] * v, axis=1) <= TOUCH_M)[0]]
+    assert pair(at(ZERO, v), at(d))[0] == pytest.approx(first, abs=2e-5)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        (at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 1.01 * TOUCH_M, 1.0])),
+        (at([0.0, 0.0, 1.0], [-0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0])),
+        (at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0], [0.2, 0.0, 0.0])),
+        (at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0], tag_age_ns=NEVER_AGE_NS)),
+        (at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0], ready=False)),
+        (at([0.0, 0.0, 1.0], [0.2, math.nan, 0.0]), at([1.0, 0.0, 1.0])),
+        (at([0.0, 0.0, 1.0], [0.99 * CLOSING_M_S, 0.0, 0.0]), at([0.25, 0.0, 1.0])),
+    ],
+    ids=["they pass", "they part", "they fly abreast", "no tag seen", "no attitude", "no speed", "a slow bump"],
+)
+def test_bodies_that_do_not_close_in_have_no_time(first: Estimate, second: Estimate) -> None:
+    assert np.isnan(pair(first, second)).all()
+
+
+def test_bodies_that_are_within_reach_and_still_close_in_have_no_time_left() -> None:
+    assert pair(at([0.0, 0.0, 1.0], [0.1, 0.0, 0.0]), at([0.25, 0.0, 1.0]))[0] == 0.0
+    assert math.isnan(pair(at([0.0, 0.0, 1.0], [-0.1, 0.0, 0.0]), at([0.25, 0.0, 1.0]))[0])
+
+
+def test_pair_that_docks_is_to_touch_and_a_third_body_is_not() -> None:
+    moving, waiting = at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0])
+    for docking in (((0, 5),), ((5, 0),)):
+        assert np.isnan(pair(moving, waiting, docking)).all()
+    assert pair(moving, waiting, ((0, 7), (7, 5)))[0] > 0.0
+
+
+def test_corner_of_a_turning_row_counts_with_its_own_speed() -> None:
+    """A row of three turns in place: its end comes round to a body that its middle does not approach."""
+    row, other = assemble([(-1, 0, 0), (0, 0, 0), (1, 0, 0)], [0] * 3, [MODCUBE] * 3, [1, 2, 3]), single(8)
+    turning = at([0.0, 0.0, 1.0], turn=1.0)
+    estimates = {1: turning, 8: at([PITCH_M, 0.6, 1.0])}
+    times = times_to_collision([row, other], estimates)
+    assert times[1] == pytest.approx((0.6 - TOUCH_M) / PITCH_M, rel=1e-6)
+    assert math.isnan(times[8])
+
+
+def test_vehicle_alone_has_nobody_to_meet() -> None:
+    assert np.isnan(list(times_to_collision([assemble_vehicle(MODCUBE)], {0: at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0])}).values()))
+
+
+# ------------------------------------------------------------ whole ticks
+
+
+def two_in_the_water(parameters: Parameters) -> FaultyTank:
+    tank = FaultyTank([(0, 0, 0), (1, 0, 0)], parameters, apart=True)
+    for state, x_m in zip(tank.states, (0.0, 1.2), strict=True):
+        state[:7] = [x_m, 0.0, 0.8, *from_euler(0.0, 0.0, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
+    return tank
+
+
+def distances(tank: FaultyTank) -> np.ndarray:
+    """Distance of both centres in every tick, m."""
+    return np.array([np.linalg.norm(states[0][:3] - states[1][:3]) for states in tank.past])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", [Mode.GUIDED, Mode.POSHOLD])
+def test_body_that_is_sent_through_another_stops_before_it(mode: Mode) -> None:
+    tank = two_in_the_water(Parameters())
+    beyond = Setpoint(np.array([2.4, 0.0, 0.8]), LEVEL, ZERO, ZERO, ZERO, ZERO)
+    sent = [Request(Action.SET_POINT, 0, beyond), Request(Action.SET_MODE, 0, Mode.GUIDED)]
+    tank.run(8.0, *(sent if mode == Mode.GUIDED else [Request(Action.HOLD, 0, beyond)]))
+    assert tank.when("fail-safe on: another body is in the way")
+    assert TOUCH_M < distances(tank).min() < 0.6
+    assert [record.mode for record in tank.outputs[-1].records] == [Mode.POSHOLD] * 2
+    assert np.linalg.norm(tank.states[0][7:10]) < 0.01 and np.linalg.norm(tank.states[1][:3] - [1.2, 0.0, 0.8]) < 0.01
+
+
+@pytest.mark.slow
+def test_without_the_fail_safe_it_would_fly_into_the_other() -> None:
+    tank = two_in_the_water(Parameters().replace("failsafes.collision_action", 0))
+    beyond = Setpoint(np.array([2.4, 0.0, 0.8]), LEVEL, ZERO, ZERO, ZERO, ZERO)
+    tank.run(8.0, Request(Action.HOLD, 0, beyond))
+    assert distances(tank).min() < 0.5 * EDGE_M
+
+
+@pytest.mark.slow
+def test_body_may_be_brought_before_a_face_and_leave_again() -> None:
+    tank = two_in_the_water(Parameters())
+    before = 1.2 - PITCH_M - Parameters().docking.standoff_m
+    for x_m in (before, 0.0):
+        tank.run(8.0, Request(Action.HOLD, 0, Setpoint(np.array([x_m, 0.0, 0.8]), LEVEL, ZERO, ZERO, ZERO, ZERO)))
+        assert tank.states[0][0] == pytest.approx(x_m, abs=0.01)
+    assert not any("another body" in said for _, said in tank.event_log)
