@@ -15,7 +15,7 @@ from firmware_py.description.signals import read_signals
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.prepare.assembly import PITCH_M
 from hil.plant.fault_spec import Fault
-from hil.scenario import load_scenario
+from hil.scenario import Step, load_scenario
 from tests.closed_loop.flights import Fly
 
 LARGEST_JUMP_N = 1.0
@@ -129,3 +129,27 @@ def test_module_whose_magnet_fails_in_flight_is_missed(fly: Fly, tmp_path: Path,
         np.testing.assert_allclose(body["p_wb"][-1], body["setpoint_p_wb"][-1], atol=0.03)
     apart = float(np.linalg.norm(truth["/plant/module0"]["p_wm"][-1] - truth["/plant/module1"]["p_wm"][-1]))
     assert (apart > PITCH_M + 0.005) == is_torn
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("action", [0, 2], ids=["without", "with"])
+def test_body_whose_path_leads_through_another_stops_with_room_to_spare(fly: Fly, tmp_path: Path, action: int) -> None:
+    """With late noisy tags, in a current. Without the fail-safe it pushes the other one aside."""
+    scenario = load_scenario("dock")
+    places = dict(zip((1, 2), ([-0.1, 0.0, 0.38], [0.5, 0.0, 0.38]), strict=True))
+    modules = tuple(dataclasses.replace(each, position_m=np.array(places[each.number])) for each in scenario.module)
+    through = Step(do="move", module=2, position_m=np.array([-0.5, 0.0, 0.38]), duration_s=6.0)
+    start = dataclasses.replace(scenario.start, position_m=np.array([0.0, 0.02, 0.0]))
+    scenario = dataclasses.replace(scenario, module=modules, step=(through,), start=start)
+    fly(scenario, 4, Parameters().replace("failsafes.collision_action", action))
+    truth = read_signals(tmp_path / "run" / "truth.mcap")
+    (first, second), at = (truth[f"/plant/module{n}"]["p_wm"] for n in range(2)), 10 * 100
+    edge_m = PITCH_M - 0.02
+    nearest_m = np.linalg.norm(second[at:] - first[at:], axis=1).min()
+    moved_m = np.linalg.norm(first[at:] - first[at], axis=1).max()
+    if action:
+        assert edge_m + 0.05 < nearest_m < 0.45 and moved_m < 0.02
+    else:
+        assert nearest_m < edge_m + 0.03 and moved_m > 0.05
+    records = read_signals(tmp_path / "run" / "signals.mcap")["/firmware/body1"]
+    assert (records["mode"][-1] == Mode.POSHOLD) == bool(action)
