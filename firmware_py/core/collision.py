@@ -39,17 +39,25 @@ def times_to_collision(
         if set(pair) <= set(numbers):
             a, b = map(numbers.index, pair)
             ignored[a, b] = ignored[b, a] = True
-    motions = [_motion(body, estimates[body.index]) for body in placed]
+    motions = [_motion(*estimates[body.index][:3], body.r_bm) for body in placed]
     r_w, v_w = (np.concatenate(arrays) for arrays in zip(*motions, strict=True))
     radius_m = np.concatenate([body.radius_m for body in placed])
     of_body = np.repeat(np.arange(len(placed)), [len(body.modules) for body in placed])
     return times | dict(zip(numbers, _soonest(r_w, v_w, radius_m, of_body, ignored).tolist(), strict=True))
 
 
-def _motion(body: Body, at: Estimate) -> tuple[np.ndarray, np.ndarray]:
+@njit(f"Tuple((float64[:,::1],float64[:,::1]))({V},{V},{V},float64[:,::1])", cache=True)
+def _motion(p_wb, q_wb, nu, r_bm):  # type: ignore[no-untyped-def]
     """(m, 3) places of a body's modules, m, and (m, 3) their velocities, m/s, world."""
-    turned = to_matrix(at.q_wb).T
-    return at.p_wb + body.r_bm @ turned, (at.nu[:3] + np.cross(at.nu[3:], body.r_bm)) @ turned
+    r_wb = to_matrix(q_wb)
+    r_w, v_w = np.empty_like(r_bm), np.empty_like(r_bm)
+    for m in range(r_bm.shape[0]):
+        x, y, z = r_bm[m]
+        vx, vy, vz = nu[0] + nu[4] * z - nu[5] * y, nu[1] + nu[5] * x - nu[3] * z, nu[2] + nu[3] * y - nu[4] * x
+        for k in range(3):
+            r_w[m, k] = p_wb[k] + r_wb[k, 0] * x + r_wb[k, 1] * y + r_wb[k, 2] * z
+            v_w[m, k] = r_wb[k, 0] * vx + r_wb[k, 1] * vy + r_wb[k, 2] * vz
+    return r_w, v_w
 
 
 @njit(f"float64[:](float64[:,::1],float64[:,::1],{V},int64[::1],boolean[:,::1])", cache=True)
