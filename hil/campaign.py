@@ -105,8 +105,11 @@ def run_campaign(
     out: Path,
     progress: Callable[[int, int], None] | None = None,
     anew: bool = False,
+    unusual: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Flies every seed that `out` does not hold yet; writes campaign.json and trials.csv there; returns the content of campaign.json.
+
+    `unusual`: options that differ from the scenario or the defaults, for campaign.json.
 
     Raises DescriptionError if `out` holds another campaign (which `anew` discards instead), a flight, or files of another origin, and for
     seeds that kill their workers; OSError if the disk is full.
@@ -121,7 +124,7 @@ def run_campaign(
                     progress(sum(seed in file.trials for seed in seeds), len(seeds))
             trials = [file.trials[seed] for seed in sorted(seeds)]
         flown = flown_of(scenario, parameters)
-        summary = summarise(scenario.name, trials) | flown._asdict() | {"vehicles": list(flown.vehicles)}
+        summary = summarise(scenario.name, trials) | flown._asdict() | {"vehicles": list(flown.vehicles), "unusual": list(unusual)}
         (out / SUMMARY_FILE).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
         (out / TABLE_FILE).write_text(table_of(trials), encoding="utf-8")
     return summary

@@ -195,7 +195,7 @@ def campaign(
     parameters, seeds = parameters_of(controller), range(seed, seed + trials)
     with _report_resume_on_interrupt(), interrupted_once(), campaign_progress(f"{chosen.name}, {trials} seeds", trials) as progress:
         pool = dask_cluster(dask) if dask else processes(jobs)
-        summary = run_campaign(chosen, parameters, seeds, pool, folder, progress)
+        summary = run_campaign(chosen, parameters, seeds, pool, folder, progress, unusual=unusual)
     print_campaign(summary)
     for worst in summary["worst_seeds"][:draw]:
         again = folder / f"seed-{worst}"

@@ -15,9 +15,9 @@ from firmware_py.core.body import Body
 from firmware_py.core.rotations import V, to_matrix
 from firmware_py.core.types import Estimate
 
-CLOSING_M_S = 0.05
-"""Speed at which a module must itself move towards another to count as closing in. A hull bears a slower bump, and bodies that hover
-beside each other reach half of it in gusts."""
+CLOSING_M_S = 0.08
+"""Speed at which a module must itself move towards another to count as closing in. A hull bears a slower bump (docks touch at up to
+0.06), and a body may pass close by another slowly."""
 
 
 def times_to_collision(

@@ -34,13 +34,13 @@ def test_campaign_flies_every_seed_and_writes_what_it_returns(tmp_path: Path, mo
     def count(done: int, total: int) -> None:
         counted.append((done, total))
 
-    summary = fly(tmp_path, range(5, 8), progress=count)
+    summary = fly(tmp_path, range(5, 8), progress=count, unusual=["ideal"])
     assert sorted(seed for seed, _ in flown) == [5, 6, 7]
     assert len({bus for _, bus in flown}) == 3  # trials in one process must not hear each other
     assert counted == [(1, 3), (2, 3), (3, 3)]
     assert summary == json.loads((tmp_path / SUMMARY_FILE).read_text())
     assert summary["seeds"] == [5, 6, 7]
-    assert (summary["controller"], summary["vehicles"]) == ("modcube", ["modcube"])
+    assert (summary["controller"], summary["vehicles"], summary["unusual"]) == ("modcube", ["modcube"], ["ideal"])
     rows = (tmp_path / TABLE_FILE).read_text().splitlines()
     assert rows[0] == "seed,passed,outcome,position_rmse_m,nis_mean,duration_s,world.mass_factor"
     assert rows[1] == "5,1,passed,0.005,,40.0,1.05"

@@ -150,7 +150,7 @@ def test_folder_that_is_a_file_is_refused_with_what_is_needed(command: list[str]
     assert line == f"modcube: {file}: is a file; a folder is needed"
 
 
-def find_the_disk_full(*_: object) -> None:
+def find_the_disk_full(*_: object, **__: object) -> None:
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
@@ -296,7 +296,8 @@ def test_campaigns_of_different_robots_have_folders_of_their_own(
     """So that none refuses to begin because of another's trials."""
     taken: list[Path] = []
 
-    def fly(scenario: object, parameters: object, seeds: object, pool: object, out: Path, progress: object) -> None:
+    def fly(scenario: object, parameters: object, seeds: object, pool: object, out: Path, progress: object, unusual: list[str]) -> None:
+        assert out.name == "-".join(["hover", *unusual, "campaign"])
         taken.append(out)
         raise KeyboardInterrupt
 

@@ -73,6 +73,11 @@ def test_push_counts_only_while_no_tag_tells_what_it_does() -> None:
     assert alarms_of(quick("pushed"), pushed._replace(tag_age_s=math.nextafter(UNSEEN_S, math.inf)))
 
 
+def test_nearer_body_is_the_worse_one() -> None:
+    assert alarms_of(quick("collision"), GOOD._replace(collision_s=0.4))
+    assert alarms_of(quick("collision"), GOOD._replace(collision_s=0.6)) == []
+
+
 COUNTS = {
     "depth_unknown": POSE_MODES | {Mode.ALT_HOLD},
     "tag_gone": POSE_MODES,
