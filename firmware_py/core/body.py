@@ -126,7 +126,7 @@ class Body:
         tag_ids: (t,) ids; tag_module: (t,) index within the body; r_bt: (t, 3); q_bt: (t, 4) tag frame to body frame.
         tag_module and r_bt follow the order of tag_ids.
         supply_power_w: (m,) power that each module's supply can give to its thrusters and magnets.
-        radius_m: (m,) half the diagonal of each module's hull, seen from above, m.
+        hull_m: (m, 3) edges of each module's hull, a box, along the axes of the body, m.
         reach_m: largest distance of any point of its hulls from the centre of mass, m.
         depth_rating_m: largest depth that all its vehicles are made for, m.
         cells: (m, 3) lattice cells; name: for display.
@@ -153,7 +153,7 @@ class Body:
     r_bt: np.ndarray
     q_bt: np.ndarray
     supply_power_w: np.ndarray
-    radius_m: np.ndarray
+    hull_m: np.ndarray
     reach_m: float
     passive: tuple[int, ...]
     depth_rating_m: float

@@ -1,6 +1,6 @@
 """Time to collision of each body with the others, if all moved on as they do now: a figure of the health (`collision_s`).
 
-A hull counts as a sphere whose radius is half the diagonal of the hull seen from above: level hulls cannot touch before these do.
+A hull counts as the upright cylinder about its box as it is turned now.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.rotations import V, to_matrix
 from firmware_py.core.types import Estimate
 
+M = "float64[:,::1]"
 CLOSING_M_S = 0.08
 """Speed at which a module must itself move towards another to count as closing in. A hull bears a slower bump (docks touch at up to
 0.06), and a body may pass close by another slowly."""
@@ -39,44 +40,63 @@ def times_to_collision(
         if set(pair) <= set(numbers):
             a, b = map(numbers.index, pair)
             ignored[a, b] = ignored[b, a] = True
-    motions = [_motion(*estimates[body.index][:3], body.r_bm) for body in placed]
-    r_w, v_w = (np.concatenate(arrays) for arrays in zip(*motions, strict=True))
-    radius_m = np.concatenate([body.radius_m for body in placed])
+    modules = [_in_world(*estimates[body.index][:3], body.r_bm, body.hull_m) for body in placed]
     of_body = np.repeat(np.arange(len(placed)), [len(body.modules) for body in placed])
-    return times | dict(zip(numbers, _soonest(r_w, v_w, radius_m, of_body, ignored).tolist(), strict=True))
+    soonest = _soonest(*map(np.concatenate, zip(*modules, strict=True)), of_body, ignored)
+    return times | dict(zip(numbers, soonest.tolist(), strict=True))
 
 
-@njit(f"Tuple((float64[:,::1],float64[:,::1]))({V},{V},{V},float64[:,::1])", cache=True)
-def _motion(p_wb, q_wb, nu, r_bm):  # type: ignore[no-untyped-def]
-    """(m, 3) places of a body's modules, m, and (m, 3) their velocities, m/s, world."""
+@njit(f"Tuple(({M},{M},{M}))({V},{V},{V},{M},{M})", cache=True)
+def _in_world(p_wb, q_wb, nu, r_bm, hull_m):  # type: ignore[no-untyped-def]
+    """(m, 3) places of a body's modules, m, (m, 3) their velocities, m/s, world, and (m, 2) radius and half the height of the upright
+    cylinders about their hulls, m.
+    """
     r_wb = to_matrix(q_wb)
-    r_w, v_w = np.empty_like(r_bm), np.empty_like(r_bm)
+    r_w, v_w, cylinder = np.empty_like(r_bm), np.empty_like(r_bm), np.zeros((r_bm.shape[0], 2))
     for m in range(r_bm.shape[0]):
         x, y, z = r_bm[m]
         vx, vy, vz = nu[0] + nu[4] * z - nu[5] * y, nu[1] + nu[5] * x - nu[3] * z, nu[2] + nu[3] * y - nu[4] * x
         for k in range(3):
             r_w[m, k] = p_wb[k] + r_wb[k, 0] * x + r_wb[k, 1] * y + r_wb[k, 2] * z
             v_w[m, k] = r_wb[k, 0] * vx + r_wb[k, 1] * vy + r_wb[k, 2] * vz
-    return r_w, v_w
+        a, b, c = 0.5 * hull_m[m]
+        for corner in range(4):  # the other four are opposite
+            i, j = a * (1 - 2 * (corner // 2)), b * (1 - 2 * (corner % 2))
+            north, east, down = r_wb[0, 0] * i + r_wb[0, 1] * j, r_wb[1, 0] * i + r_wb[1, 1] * j, r_wb[2, 0] * i + r_wb[2, 1] * j
+            radius = math.hypot(north + r_wb[0, 2] * c, east + r_wb[1, 2] * c)
+            cylinder[m, 0] = max(cylinder[m, 0], radius)
+            cylinder[m, 1] = max(cylinder[m, 1], abs(down + r_wb[2, 2] * c))
+    return r_w, v_w, cylinder
 
 
-@njit(f"float64[:](float64[:,::1],float64[:,::1],{V},int64[::1],boolean[:,::1])", cache=True)
-def _soonest(r_w, v_w, radius_m, of_body, ignored):  # type: ignore[no-untyped-def]
-    """(b,) the least time to collision over all pairs of modules of two bodies: the first root of |d + w t| = the sum of the radii."""
+@njit("UniTuple(float64,2)(float64,float64,float64)", cache=True)
+def _within(excess, rate, speed2):  # type: ignore[no-untyped-def]
+    """Times from when to when excess + 2 rate t + speed2 t^2 is at most 0; infinity to minus infinity if it never is."""
+    if speed2 < 1e-12:
+        return (-math.inf, math.inf) if excess <= 0.0 else (math.inf, -math.inf)
+    under_root = rate * rate - speed2 * excess
+    if under_root < 0.0:
+        return math.inf, -math.inf
+    return (-rate - math.sqrt(under_root)) / speed2, (-rate + math.sqrt(under_root)) / speed2
+
+
+@njit(f"{V}({M},{M},{M},int64[::1],boolean[:,::1])", cache=True)
+def _soonest(r_w, v_w, cylinder, of_body, ignored):  # type: ignore[no-untyped-def]
+    """(b,) the least time to collision over all pairs of modules of two bodies, s; NaN where there is none."""
     out = np.full(ignored.shape[0], np.nan)
     for i in range(of_body.size):
         for j in range(of_body.size):
             if ignored[of_body[i], of_body[j]]:
                 continue
-            square = speed2 = closing = own = 0.0
-            for k in range(3):
-                d, w = r_w[j, k] - r_w[i, k], v_w[j, k] - v_w[i, k]
-                square, speed2, closing, own = square + d * d, speed2 + w * w, closing - d * w, own + d * v_w[i, k]
-            excess = square - (radius_m[i] + radius_m[j]) ** 2
-            under_root = closing * closing - speed2 * excess
-            if not (closing > 0.0 and own > CLOSING_M_S * math.sqrt(square) and (excess <= 0.0 or under_root >= 0.0)):
-                continue  # they part, or pass each other, or only the other one moves
-            time_s = 0.0 if excess <= 0.0 else excess / (closing + math.sqrt(under_root))
-            if not time_s >= out[of_body[i]]:
-                out[of_body[i]] = time_s
+            north, east, down = r_w[j, 0] - r_w[i, 0], r_w[j, 1] - r_w[i, 1], r_w[j, 2] - r_w[i, 2]
+            v_n, v_e, v_d = v_w[j, 0] - v_w[i, 0], v_w[j, 1] - v_w[i, 1], v_w[j, 2] - v_w[i, 2]
+            own = north * v_w[i, 0] + east * v_w[i, 1] + down * v_w[i, 2]
+            level_rate, down_rate, level2, down2 = north * v_n + east * v_e, down * v_d, north**2 + east**2, down**2
+            if level_rate + down_rate < 0.0 and own > CLOSING_M_S * math.sqrt(level2 + down2):  # not where it is NaN
+                radius_m, height_m = cylinder[i, 0] + cylinder[j, 0], cylinder[i, 1] + cylinder[j, 1]
+                beside = _within(level2 - radius_m**2, level_rate, v_n**2 + v_e**2)
+                above = _within(down2 - height_m**2, down_rate, v_d**2)
+                begins = max(beside[0], above[0], 0.0)
+                if begins <= min(beside[1], above[1]) and not begins >= out[of_body[i]]:
+                    out[of_body[i]] = begins
     return out

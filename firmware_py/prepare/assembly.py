@@ -140,7 +140,7 @@ def _body(placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: fl
         r_bt=np.array([r_bm[k] + MATRICES[placements[k].rotation] @ tag.position_m for k, tag in tags]).reshape(-1, 3),
         q_bt=np.array([_turned(q_bm[k], tag.quaternion) for k, tag in tags]).reshape(-1, 4),
         supply_power_w=np.array([_power(p.vehicle) for p in placements]),
-        radius_m=np.array([_radius_m(p) for p in placements]),
+        hull_m=np.array([np.abs(MATRICES[p.rotation] @ p.vehicle.hull.size_m) for p in placements]),
         reach_m=max(_reach_m(p.vehicle, r) for p, r in zip(placements, r_bm, strict=True)),
         passive=_passive(placements, thrusters.matrix),
         depth_rating_m=min(p.vehicle.depth_rating_m for p in placements),
@@ -172,11 +172,6 @@ def _turned(q_bm: np.ndarray, q_mt: np.ndarray) -> np.ndarray:
 
 def _power(vehicle: Vehicle) -> float:
     return vehicle.supply.voltage_v * vehicle.supply.current_a - vehicle.supply.idle_w
-
-
-def _radius_m(placement: Placement) -> float:
-    """Half the diagonal of the hull's box, seen from above, m."""
-    return float(0.5 * np.linalg.norm((MATRICES[placement.rotation] @ placement.vehicle.hull.size_m)[:2]))
 
 
 def _reach_m(vehicle: Vehicle, r_bm: np.ndarray) -> float:

@@ -5,10 +5,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from firmware_py.core.body import Body
 from firmware_py.core.collision import CLOSING_M_S, times_to_collision
-from firmware_py.core.rotations import from_euler
+from firmware_py.core.rotations import from_euler, rotate_back
 from firmware_py.core.types import NEVER_AGE_NS, Action, Estimate, Mode, Request, Setpoint
 from firmware_py.description.parameters import Parameters
 from firmware_py.prepare.assembly import PITCH_M, assemble, assemble_vehicle
@@ -35,10 +36,6 @@ def pair(first: Estimate, second: Estimate, docking: tuple[tuple[int, int], ...]
     return tuple(times_to_collision(bodies, {0: first, 5: second}, docking).values())  # type: ignore[return-value]
 
 
-def test_radius_is_that_of_the_circle_about_the_level_hull() -> None:
-    assert single(0).radius_m == pytest.approx([0.5 * TOUCH_M])
-
-
 def test_time_is_the_gap_over_the_closing_speed() -> None:
     moving, waiting = pair(at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0]))
     assert moving == pytest.approx((1.0 - TOUCH_M) / 0.2, rel=1e-9)
@@ -51,8 +48,35 @@ def test_time_off_the_straight_line_is_that_of_small_steps() -> None:
     """Against a march in steps of 10 us."""
     v, d = np.array([0.31, 0.12, -0.07]), np.array([0.9, 0.2, -0.15])
     t = np.arange(0.0, 5.0, 1e-5)
-    first = t[np.flatnonzero(np.linalg.norm(d - t[:, None] * v, axis=1) <= TOUCH_M)[0]]
+    left = d - t[:, None] * v
+    first = t[np.flatnonzero((np.hypot(left[:, 0], left[:, 1]) <= TOUCH_M) & (np.abs(left[:, 2]) <= EDGE_M))[0]]
     assert pair(at(ZERO, v), at(d))[0] == pytest.approx(first, abs=2e-5)
+
+
+@pytest.mark.parametrize("tilt", [from_euler(0.0, 0.0, 0.0), from_euler(0.7, 0.3, 0.2), from_euler(0.6155, 0.7854, 0.0)])
+@pytest.mark.parametrize("towards", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 1.0, 1.0), (0.3, -1.0, 0.7), (-1.0, 1.0, -3.0)])
+def test_hulls_touch_no_sooner_than_the_time_says(tilt: np.ndarray, towards: tuple[float, float, float]) -> None:
+    """Against the boxes themselves, by their separating axes (Gottschalk 1996): they overlap when the cylinders do, or later."""
+    way = np.array(towards) / np.linalg.norm(towards)
+    speed, corner_m = 0.2, 0.5 * EDGE_M
+    first, other = at(ZERO, rotate_back(tilt, speed * way), q_wb=tilt), at(way)
+    time_s = pair(first, other)[0]
+    axes = Rotation.from_quat(tilt[[1, 2, 3, 0]]).as_matrix()
+    separating = [*axes.T, *np.eye(3), *(np.cross(a, b) for a in axes.T for b in np.eye(3))]
+
+    def apart(t_s: float) -> bool:
+        return any(
+            abs(axis @ (way - t_s * speed * way)) > corner_m * (np.abs(axis @ axes).sum() + np.abs(axis).sum()) for axis in separating
+        )
+
+    assert apart(time_s - 1e-6)
+    touching_s = next(t for t in np.arange(time_s, 5.0, 0.01) if not apart(t))
+    assert touching_s - time_s < (3.0**0.5 - 1.0) * EDGE_M / speed, "the cylinder is not much larger than the hull"
+
+
+def test_hull_above_another_has_its_height_for_a_reach() -> None:
+    assert pair(at([0.0, 0.0, 1.0], [0.0, 0.0, 0.2]), at([0.1, 0.0, 2.0]))[0] == pytest.approx((1.0 - EDGE_M) / 0.2, rel=1e-9)
+    assert math.isnan(pair(at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0 + 1.01 * EDGE_M]))[0]), "it passes above"
 
 
 @pytest.mark.parametrize(
