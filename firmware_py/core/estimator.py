@@ -24,7 +24,7 @@ from firmware_py.core.alignment import TagAgreement, upright
 from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.depth_gate import MOST_STEP_M
 from firmware_py.core.history import WINDOW_NS, History
-from firmware_py.core.propagation import ERRORS, STATES
+from firmware_py.core.propagation import ERRORS, STATES, Error, Nominal
 from firmware_py.core.rigid_body import restoring_moment
 from firmware_py.core.rotations import heading, multiply, rotate, to_matrix
 from firmware_py.core.topology import Motion, down_of
@@ -51,14 +51,12 @@ STILL_DENSITY = 0.0003
 NORTH_DENSITY = 1e-4
 """Noise density of the heading pseudo-measurement before the first tag, rad^2 s. Until then the believed heading defines north, so it is
 known by definition. Without this the filter fitted the heading to noise: a bump turned the estimate by a third of a circle."""
-KEPT_STATES, VELOCITY_ERRORS, GYRO_BIAS_ERRORS = np.r_[10:19, 21:25, 26:29], slice(6, 9), slice(12, 15)
-"""Entries that matter when tags relocate a body that was adrift. KEPT_STATES: angular rates, biases, vertical force, moment and righting
-vector, which do not depend on the heading, survive. VELOCITY_ERRORS: their covariance is set from `SPEED_SIGMA`. GYRO_BIAS_ERRORS: their
-covariance stays: with a larger variance the filter would take the next unmodelled bump for a bias."""
+KEPT_STATES = np.r_[Nominal.RATE, Nominal.GYRO_BIAS, Nominal.ACCEL_BIAS, Nominal.VERTICAL_FORCE, Nominal.MOMENT, Nominal.RIGHTING]
+"""Indices of what survives in the state when tags relocate a body that was adrift, because it does not depend on the heading."""
 WAY_S = 0.01
 """Sample period for which `accel_under_way` gives the error of one sample. A wrong mass causes the same error in all samples within that
 time, so that more samples carry no more information."""
-LEARNT, LEARNT_ERRORS, LEARNT_SIGMAS = np.r_[22:25, 26:29], np.r_[21:24, 25:28], 5.0
+LEARNT, LEARNT_ERRORS, LEARNT_SIGMAS = np.r_[Nominal.MOMENT, Nominal.RIGHTING], np.r_[Error.MOMENT, Error.RIGHTING], 5.0
 """Indices of moment and righting vector in the state and in the error, and the limit in initial sigmas within which they are kept when the
 filter restarts because it refused too many tags. A wrong position does not spoil them; but a value outside the limit may be the very reason
 why tags were refused. Biases and vertical force are not kept: while tags are refused, they absorb whatever does not fit."""
@@ -120,7 +118,7 @@ class Estimator:
     @property
     def q_wb(self) -> np.ndarray:
         """Latest attitude, (4,)."""
-        return np.asarray(self._now[3:7])
+        return np.asarray(self._now[Nominal.ATTITUDE])
 
     def expected_depth(self, time_ns: int) -> ExpectedDepth | None:
         """Returns what the body's depth sensors are to tell at `time_ns`; None unless tags tell the depth.
@@ -129,8 +127,8 @@ class Estimator:
         """
         if not self._accepted or time_ns - self._last_tag_ns > BLIND_NS:
             return None
-        sigma_m = math.sqrt(self._depth_variance + self._head.covariance[24, 24] + self._p.depth_sigma_m**2)
-        return ExpectedDepth(float(self._now[2] + self._now[25]), sigma_m, to_matrix(self.q_wb)[2].tolist())
+        sigma_m = math.sqrt(self._depth_variance + self._head.covariance[Error.DEPTH_BIAS, Error.DEPTH_BIAS] + self._p.depth_sigma_m**2)
+        return ExpectedDepth(float(self._now[2] + self._now[Nominal.DEPTH_BIAS]), sigma_m, to_matrix(self.q_wb)[2].tolist())
 
     def step(self, time_ns: int, measured: Measured, tau: np.ndarray) -> Estimate:
         """Returns the estimate at `time_ns`.
@@ -194,9 +192,9 @@ class Estimator:
 
     def _start(self, pose: BodyPose) -> None:
         x = np.zeros(STATES)
-        x[3:7] = pose.q_wb
-        x[:3] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
-        x[29:] = down_of(x)
+        x[Nominal.ATTITUDE] = pose.q_wb
+        x[Nominal.POSITION] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
+        x[Nominal.DOWN] = down_of(x)
         self._history.forget_depths(float(x[2]), MOST_STEP_M)
         inertia = np.diag(self._body.mass)
         sigma = np.r_[np.repeat(np.array(INITIAL_SIGMA), [3, 3, 3, 3, 3, 3, 3, 3, 1]), self._body.righting_sigma]
@@ -217,7 +215,7 @@ class Estimator:
             return
         depths = others[~np.isnan(others[:, 3]), 3]
         place = np.r_[self._now[:2], depths.mean() if len(depths) else self._now[2]]
-        self._start(BodyPose(time_ns, place, np.zeros(3), multiply(heading(self._now[3:7]), tilt), 1.0))
+        self._start(BodyPose(time_ns, place, np.zeros(3), multiply(heading(self._now[Nominal.ATTITUDE]), tilt), 1.0))
         self._anchor.covariance[2, 2] = INITIAL_SIGMA[-1] ** 2 if len(depths) else UNKNOWN_SIGMA[2] ** 2
         self._accepted, self._last_tag_ns = READY_AFTER, NEVER_NS
 
@@ -248,7 +246,7 @@ class Estimator:
 
     def _place(self, pose: BodyPose) -> None:
         """Relocates a body that was adrift once enough tags agree (`TagAgreement`); the state entries KEPT_STATES stay."""
-        if not self._tag_agreement.agrees(pose, self._anchor.x[:3], self._anchor.x[3:7]):
+        if not self._tag_agreement.agrees(pose, self._anchor.x[Nominal.POSITION], self._anchor.x[Nominal.ATTITUDE]):
             self._refuse(pose)
             return
         self._refused_in_row = 0
@@ -256,9 +254,10 @@ class Estimator:
             before, had_north = self._anchor, self._has_north
             self._start(pose)
             self._anchor.x[KEPT_STATES], self._accepted = before.x[KEPT_STATES], READY_AFTER
-            self._anchor.covariance[VELOCITY_ERRORS, VELOCITY_ERRORS] = SPEED_SIGMA**2 * np.eye(3)
-            if had_north:  # before the first tag the assumed heading makes their variance too small
-                self._anchor.covariance[GYRO_BIAS_ERRORS, GYRO_BIAS_ERRORS] = before.covariance[GYRO_BIAS_ERRORS, GYRO_BIAS_ERRORS]
+            self._anchor.covariance[Error.VELOCITY, Error.VELOCITY] = SPEED_SIGMA**2 * np.eye(3)
+            # With a larger variance of the gyro bias the filter would take the next unmodelled bump for a bias.
+            if had_north:  # before the first tag the assumed heading makes that variance too small
+                self._anchor.covariance[Error.GYRO_BIAS, Error.GYRO_BIAS] = before.covariance[Error.GYRO_BIAS, Error.GYRO_BIAS]
 
     def _advanced(self, start: Belief, to_ns: int) -> Belief:
         """Returns the belief advanced to `to_ns`, with the inertial and depth measurements on the way fused."""
@@ -324,13 +323,13 @@ class Estimator:
         if self._is_adrift:  # the horizontal position is a guess, and before the first tag the heading is too
             sigma[:2] = UNKNOWN_SIGMA[:2]
         if not self._has_north:
-            sigma[3:] += UNKNOWN_SIGMA[3:] * np.abs(to_matrix(self._now[3:7])[2])
+            sigma[3:] += UNKNOWN_SIGMA[3:] * np.abs(to_matrix(self._now[Nominal.ATTITUDE])[2])
         return sigma, sound
 
     def _forget(self) -> None:
         """Drops the estimate: the filter restarts from the next tag, or levelled by gravity at the last believed position."""
         self._accepted = self._waited = 0
-        sound = observation.are_finite(self._now[:3], self._now[3:7])
+        sound = observation.are_finite(self._now[Nominal.POSITION], self._now[Nominal.ATTITUDE])
         self._now = np.r_[self._now[:7] if sound else np.eye(1, 7, 3)[0], np.zeros(STATES - 7)]
         self._anchor = self._head = Belief(self._now, np.eye(ERRORS), 0)
 
@@ -342,11 +341,11 @@ class Estimator:
         self._depth_variance = float(sigma[2]) ** 2
         x = self._now.copy()
         return Estimate(
-            p_wb=x[:3],
-            q_wb=x[3:7],
-            nu=x[7:13],
-            force_w=x[19:22],
-            moment_b=x[22:25] + restoring_moment(x[26:29], x[3:7]),
+            p_wb=x[Nominal.POSITION],
+            q_wb=x[Nominal.ATTITUDE],
+            nu=x[Nominal.NU],
+            force_w=x[Nominal.FORCE],
+            moment_b=x[Nominal.MOMENT] + restoring_moment(x[Nominal.RIGHTING], x[Nominal.ATTITUDE]),
             sigma_p=sigma[:3],
             sigma_q=sigma[3:],
             tag_age_ns=time_ns - self._last_tag_ns,
@@ -361,12 +360,12 @@ class Estimator:
         p = self._p
         inertia = np.diag(self._body.mass)
         density = np.zeros(ERRORS)
-        density[6:9] = p.accel_process
-        density[9:12] = p.alpha_process
-        density[12:15] = p.gyro_bias_walk
-        density[15:18] = p.accel_bias_walk
-        density[18:21] = p.force_walk * inertia[:3]
-        density[21:24] = p.moment_walk * inertia[3:]
-        density[24] = p.depth_bias_walk
-        density[25:] = p.righting_walk * self._body.righting_sigma
+        density[Error.VELOCITY] = p.accel_process
+        density[Error.RATE] = p.alpha_process
+        density[Error.GYRO_BIAS] = p.gyro_bias_walk
+        density[Error.ACCEL_BIAS] = p.accel_bias_walk
+        density[Error.FORCE] = p.force_walk * inertia[:3]
+        density[Error.MOMENT] = p.moment_walk * inertia[3:]
+        density[Error.DEPTH_BIAS] = p.depth_bias_walk
+        density[Error.RIGHTING] = p.righting_walk * self._body.righting_sigma
         return density**2

@@ -8,8 +8,8 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.estimator import READY_AFTER, RESET_AFTER
-from firmware_py.core.propagation import ERRORS, STATES
-from firmware_py.core.rotations import conjugate, exp, log, multiply, rotate, to_matrix
+from firmware_py.core.propagation import ERRORS, STATES, Error, Nominal
+from firmware_py.core.rotations import difference, exp, multiply, rotate, rotate_back, to_matrix
 from firmware_py.core.topology import Motion
 from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
@@ -20,7 +20,8 @@ PAPER_ALPHA_DENSITY = 0.5
 """The same for angular acceleration, rad/s^2/sqrt(Hz); synthetic."""
 PAPER_FLIP_RAD = 0.5
 """Attitude jump beyond which a tag counts as flipped. Any working tag tracker refuses such a tag, and restarts if the jump persists."""
-PLACED, TURNED = (np.ix_([*range(i, i + 3), *range(i + 6, i + 9)], [*range(i, i + 3), *range(i + 6, i + 9)]) for i in (0, 3))
+PLACED = np.ix_(np.r_[Error.POSITION, Error.VELOCITY], np.r_[Error.POSITION, Error.VELOCITY])
+TURNED = np.ix_(np.r_[Error.ATTITUDE, Error.RATE], np.r_[Error.ATTITUDE, Error.RATE])
 """Indices of position with velocity, and of attitude with rate, in a covariance (28, 28)."""
 
 
@@ -73,9 +74,7 @@ class TagOnlyEstimator:
         are zero with zero variance.
         """
         x = np.zeros(STATES)
-        x[:3], x[3:7] = self._position[:3], self._q_wb
-        x[7:10] = rotate(conjugate(self._q_wb), self._position[3:].copy())
-        x[10:13] = self._rate_b
+        x[Nominal.POSITION], x[Nominal.ATTITUDE], x[Nominal.NU] = self._position[:3], self._q_wb, self._nu
         covariance = np.zeros((ERRORS, ERRORS))
         covariance[PLACED] = _turned(self._p_position, to_matrix(self._q_wb).T)
         covariance[TURNED] = self._p_attitude
@@ -84,9 +83,9 @@ class TagOnlyEstimator:
     def restart(self, time_ns: int, motion: Motion) -> Estimate:
         """Restarts from `motion` at `time_ns`; returns the estimate of the same tick."""
         x = motion.x
-        self._q_wb = x[3:7].copy()
-        self._position = np.concatenate([x[:3], rotate(self._q_wb, x[7:10].copy())])
-        self._rate_b = x[10:13].copy()
+        self._q_wb = x[Nominal.ATTITUDE].copy()
+        self._position = np.concatenate([x[Nominal.POSITION], rotate(self._q_wb, x[Nominal.NU][:3].copy())])
+        self._rate_b = x[Nominal.RATE].copy()
         self._p_position = _turned(motion.covariance[PLACED], to_matrix(self._q_wb))
         self._p_attitude = motion.covariance[TURNED].copy()
         self._accepted, self._last_tag_ns = motion.accepted, motion.tag_ns
@@ -103,12 +102,16 @@ class TagOnlyEstimator:
             self._fuse(pose)
         return self._estimate(time_ns)
 
+    @property
+    def _nu(self) -> np.ndarray:
+        """(6,) velocity and angular rate, body frame."""
+        return np.concatenate([rotate_back(self._q_wb, self._position[3:].copy()), self._rate_b])
+
     def _estimate(self, time_ns: int) -> Estimate:
-        nu = np.concatenate([rotate(conjugate(self._q_wb), self._position[3:].copy()), self._rate_b])
         return Estimate(
             p_wb=self._position[:3].copy(),
             q_wb=self._q_wb.copy(),
-            nu=nu,
+            nu=self._nu,
             force_w=np.zeros(3),
             moment_b=np.zeros(3),
             sigma_p=np.sqrt(self._p_position.diagonal()[:3]),
@@ -131,7 +134,7 @@ class TagOnlyEstimator:
         if not self._accepted:
             self._start(p_wb, pose.q_wb, pose.capture_ns)
             return
-        turn = log(multiply(conjugate(self._q_wb), pose.q_wb))
+        turn = difference(pose.q_wb, self._q_wb)
         if float(np.linalg.norm(turn)) > PAPER_FLIP_RAD and self._accepted >= READY_AFTER:
             self._rejected += 1
             self._refused_in_row += 1

@@ -34,6 +34,25 @@ STATE = f"Tuple(({V},{M}))"
 """Types of a state and its covariance."""
 
 
+class Nominal:
+    """Where the parts of the nominal state are in x (32,), for code that is not compiled."""
+
+    POSITION, ATTITUDE, NU = slice(0, 3), slice(3, 7), slice(7, 13)
+    RATE = slice(10, 13)
+    """Angular part of NU."""
+    GYRO_BIAS, ACCEL_BIAS, DEPTH_BIAS = slice(13, 16), slice(16, 19), 25
+    FORCE, MOMENT, RIGHTING, DOWN = slice(19, 22), slice(22, 25), slice(26, 29), slice(29, 32)
+    VERTICAL_FORCE = 21
+
+
+class Error:
+    """Where the parts of the error state are in e (28,), in each axis of its covariance, and in its process noise."""
+
+    POSITION, ATTITUDE, VELOCITY, RATE = slice(0, 3), slice(3, 6), slice(6, 9), slice(9, 12)
+    GYRO_BIAS, ACCEL_BIAS, DEPTH_BIAS = slice(12, 15), slice(15, 18), 24
+    FORCE, MOMENT, RIGHTING = slice(18, 21), slice(21, 24), slice(25, 28)
+
+
 @njit(cache=True)
 def accelerate(nu, q, external, mass, mass_inv, righting, nodes, rotational, linear, total, out):  # type: ignore[no-untyped-def]
     """Writes dnu/dt of the body under the (6,) wrench `external` (thrusters and disturbance, body frame) to `out` (6,), and the total

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.propagation import ERRORS, STATES
+from firmware_py.core.propagation import ERRORS, STATES, Error, Nominal
 from firmware_py.core.rotations import conjugate, cross, multiply, normalise, rotate, rotate_back, skew, to_matrix
 
 JOINED_SIGMA = (0.003, 0.01, 0.01, 0.03)
@@ -22,11 +22,11 @@ each has by then moved 70 mm and 0.05 rad, at 70 mm/s and 0.1 rad/s (dock-undock
 BIAS_SPREAD = np.repeat([0.005, 0.05, 0.02], [3, 3, 1])
 """(7,) sigma of the biases of gyro, rad/s, accelerometer, m/s^2, and depth, m, between modules (synthetic, as the bench draws
 them). A body estimates their mean."""
-BIASES = np.r_[12:18, 24]
+BIASES = np.r_[Error.GYRO_BIAS, Error.ACCEL_BIAS, Error.DEPTH_BIAS]
 """Indices of these biases in the error state."""
 LEVEL = np.array([1.0, 1.0, 0.0])
 """Mask of the horizontal part of a force in the world."""
-TURNING = np.ix_(np.r_[21:24, 25:28], np.r_[21:24, 25:28])
+TURNING = np.ix_(np.r_[Error.MOMENT, Error.RIGHTING], np.r_[Error.MOMENT, Error.RIGHTING])
 """Index of disturbance moment and righting in a covariance (28, 28)."""
 
 
@@ -43,7 +43,7 @@ class Motion(NamedTuple):
 
 def down_of(x: np.ndarray) -> np.ndarray:
     """(3,) unit vector down, in the axes of a body in state x."""
-    return np.asarray(to_matrix(x[3:7].copy())[2])
+    return np.asarray(to_matrix(x[Nominal.ATTITUDE].copy())[2])
 
 
 def in_both(mine: Sequence[int], theirs: Sequence[int]) -> list[tuple[int, int]]:
@@ -55,23 +55,24 @@ def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
     """State of `body`, made of the bodies `parts`; its first module is one of the first part."""
     x = np.zeros(STATES)
     first, motion = parts[0]
-    x[3:7] = _attitude(first, motion.x, body)
-    x[:3] = _position(first, motion.x, body, x[3:7])
+    x[Nominal.ATTITUDE] = _attitude(first, motion.x, body)
+    x[Nominal.POSITION] = _position(first, motion.x, body, x[Nominal.ATTITUDE])
     momentum, force, moment, off = np.zeros(6), np.zeros(3), np.zeros(3), np.zeros(3)
     for part, moved in parts:
         lever_b, turn = _place(part, body)
         h = _transport(lever_b, turn)
-        momentum += h.T @ part.mass @ moved.x[7:13]
-        force += moved.x[19:22]
-        level_b = rotate_back(x[3:7].copy(), moved.x[19:22] * LEVEL)
-        moment += turn.T @ moved.x[22:25] + cross(lever_b, level_b)
-        off += turn.T @ moved.x[26:29] - lever_b * moved.x[21]  # a vertical force at a lever has a righting moment
-    x[7:13] = body.mass_inv @ momentum
-    x[19:22], x[22:25], x[26:29] = force, moment, off
+        momentum += h.T @ part.mass @ moved.x[Nominal.NU]
+        force += moved.x[Nominal.FORCE]
+        level_b = rotate_back(x[Nominal.ATTITUDE].copy(), moved.x[Nominal.FORCE] * LEVEL)
+        moment += turn.T @ moved.x[Nominal.MOMENT] + cross(lever_b, level_b)
+        off += turn.T @ moved.x[Nominal.RIGHTING] - lever_b * moved.x[Nominal.VERTICAL_FORCE]  # which has a righting moment at a lever
+    x[Nominal.NU] = body.mass_inv @ momentum
+    x[Nominal.FORCE], x[Nominal.MOMENT], x[Nominal.RIGHTING] = force, moment, off
     modules = [len(part.modules) for part, _ in parts]
-    x[13:19] = np.average([_biases(part, moved.x, body) for part, moved in parts], axis=0, weights=modules)
-    x[25] = np.average([moved.x[25] for _, moved in parts], weights=modules)
-    x[29:] = down_of(x)
+    biases = np.average([_biases(part, moved.x, body) for part, moved in parts], axis=0, weights=modules)
+    x[Nominal.GYRO_BIAS], x[Nominal.ACCEL_BIAS] = biases[:3], biases[3:]
+    x[Nominal.DEPTH_BIAS] = np.average([moved.x[Nominal.DEPTH_BIAS] for _, moved in parts], weights=modules)
+    x[Nominal.DOWN] = down_of(x)
     accepted, tag_ns = min(moved.accepted for _, moved in parts), min(moved.tag_ns for _, moved in parts)
     return Motion(x, _covariance(motion, first, x, body, JOINED_SIGMA), accepted, tag_ns)
 
@@ -79,16 +80,17 @@ def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
 def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
     """State of `body`, which was a piece of `whole`. The disturbance is shared out by mass."""
     x = motion.x.copy()
-    x[3:7] = _attitude(whole, motion.x, body)
-    x[:3] = _position(whole, motion.x, body, x[3:7])
+    x[Nominal.ATTITUDE] = _attitude(whole, motion.x, body)
+    x[Nominal.POSITION] = _position(whole, motion.x, body, x[Nominal.ATTITUDE])
     lever_b, turn = _place(body, whole)
-    x[7:13] = _transport(lever_b, turn) @ motion.x[7:13]
+    x[Nominal.NU] = _transport(lever_b, turn) @ motion.x[Nominal.NU]
     share = body.rigid_mass_kg / whole.rigid_mass_kg
-    x[19:22] = motion.x[19:22] * share
-    x[22:25] = turn @ motion.x[22:25] * share
-    x[26:29] = turn @ motion.x[26:29] * share
-    x[13:19] = _biases(whole, motion.x, body)
-    x[29:] = down_of(x)
+    x[Nominal.FORCE] = motion.x[Nominal.FORCE] * share
+    x[Nominal.MOMENT] = turn @ motion.x[Nominal.MOMENT] * share
+    x[Nominal.RIGHTING] = turn @ motion.x[Nominal.RIGHTING] * share
+    biases = _biases(whole, motion.x, body)
+    x[Nominal.GYRO_BIAS], x[Nominal.ACCEL_BIAS] = biases[:3], biases[3:]
+    x[Nominal.DOWN] = down_of(x)
     covariance = _covariance(motion, whole, x, body, PARTED_SIGMA)
     covariance[BIASES, BIASES] += BIAS_SPREAD**2 * (1.0 / len(body.modules) - 1.0 / len(whole.modules))
     return Motion(x, covariance, motion.accepted, motion.tag_ns)
@@ -121,19 +123,20 @@ def _attitude(old: Body, x: np.ndarray, new: Body) -> np.ndarray:
     """(4,) attitude of `new` from that of `old`, by a module that both contain."""
     i, j = in_both(old.modules, new.modules)[0]
     turn = multiply(np.ascontiguousarray(old.q_bm[i]), conjugate(np.ascontiguousarray(new.q_bm[j])))
-    return np.asarray(normalise(multiply(x[3:7].copy(), turn)))
+    return np.asarray(normalise(multiply(x[Nominal.ATTITUDE].copy(), turn)))
 
 
 def _position(old: Body, x: np.ndarray, new: Body, q_new: np.ndarray) -> np.ndarray:
+    """(3,) position of `new`, which has the attitude q_new (4,), from the state of `old`, by a module that both contain."""
     i, j = in_both(old.modules, new.modules)[0]
-    p_wm = x[:3] + rotate(x[3:7].copy(), np.ascontiguousarray(old.r_bm[i]))
+    p_wm = x[Nominal.POSITION] + rotate(x[Nominal.ATTITUDE].copy(), np.ascontiguousarray(old.r_bm[i]))
     return np.asarray(p_wm - rotate(q_new, np.ascontiguousarray(new.r_bm[j])))
 
 
 def _biases(old: Body, x: np.ndarray, new: Body) -> np.ndarray:
     """(6,) gyro and accelerometer bias in the axes of `new`."""
     _, turn = _place(new, old)
-    return np.concatenate([turn @ x[13:16], turn @ x[16:19]])
+    return np.concatenate([turn @ x[Nominal.GYRO_BIAS], turn @ x[Nominal.ACCEL_BIAS]])
 
 
 def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body, shock: Sequence[float]) -> np.ndarray:
@@ -147,9 +150,10 @@ def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body, shock: Se
         shock: sigma to add to position m, attitude rad, velocity m/s, rate rad/s.
     """
     variance = old.covariance.diagonal().copy()
-    turn = to_matrix(x[3:7].copy()).T @ to_matrix(old.x[3:7].copy())
-    variance[3:18] = (variance[3:18].reshape(5, 3) @ np.square(turn).T).ravel()
-    variance[18:21] *= (after.rigid_mass_kg / before.rigid_mass_kg) ** 2
+    turn = to_matrix(x[Nominal.ATTITUDE].copy()).T @ to_matrix(old.x[Nominal.ATTITUDE].copy())
+    in_the_body = slice(3, 18)  # attitude, velocity, rate, both biases
+    variance[in_the_body] = (variance[in_the_body].reshape(5, 3) @ np.square(turn).T).ravel()
+    variance[Error.FORCE] *= (after.rigid_mass_kg / before.rigid_mass_kg) ** 2
     variance[:12] += np.repeat(np.array(shock), 3) ** 2
     out = np.diag(variance)
     assert len(out) == ERRORS
@@ -157,7 +161,7 @@ def _covariance(old: Motion, before: Body, x: np.ndarray, after: Body, shock: Se
     grown = (np.trace(after.mass[3:, 3:]) / np.trace(before.mass[3:, 3:])) ** 2
     acting = (acts @ old.covariance[TURNING] @ acts.T).diagonal() * grown
     righting = np.diag(after.righting_sigma**2)
-    out[21:24, 21:24], out[25:, 25:] = np.diag(acting) + lean @ righting @ lean.T, righting
-    out[21:24, 25:] = -lean @ righting
-    out[25:, 21:24] = out[21:24, 25:].T
+    out[Error.MOMENT, Error.MOMENT], out[Error.RIGHTING, Error.RIGHTING] = np.diag(acting) + lean @ righting @ lean.T, righting
+    out[Error.MOMENT, Error.RIGHTING] = -lean @ righting
+    out[Error.RIGHTING, Error.MOMENT] = out[Error.MOMENT, Error.RIGHTING].T
     return out
