@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Prepared
-from firmware_py.core.docking_sequence import UndockPlan
+from firmware_py.core.docking_plan import UndockPlan
 from firmware_py.core.joints import turned
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.types import DockRequest, PartRequest

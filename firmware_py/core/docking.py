@@ -14,7 +14,8 @@ from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Decisions, Estimated, Join, Part, Prepared
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector, TagTable
 from firmware_py.core.docking_pairs import APART
-from firmware_py.core.docking_sequence import ENDED, DockingSequence, DockPlan, Stage, UndockPlan
+from firmware_py.core.docking_plan import DockPlan, UndockPlan
+from firmware_py.core.docking_sequence import ENDED, DockingSequence, Stage
 from firmware_py.core.docking_traffic import Dock, Traffic, thirds_of
 from firmware_py.core.docking_way import first_blocking_module, obstacle, plans_conflict, way_of_piece
 from firmware_py.core.joint_watch import JointWatch

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.docking_sequence import DockPlan, UndockPlan
+from firmware_py.core.docking_plan import DockPlan, UndockPlan
 from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import DockRequest, Estimate, Setpoint
 

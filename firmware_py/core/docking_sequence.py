@@ -15,9 +15,10 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
+from firmware_py.core.docking_plan import DockPlan, module_in, pose_of
 from firmware_py.core.rotations import conjugate, difference, exp, multiply, normalise, rotate, rotate_back
 from firmware_py.core.setpoint import Wish
-from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockRequest, Estimate, Setpoint
+from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, Estimate, Setpoint
 from firmware_py.description.parameters import Docking
 
 SLOWING_PER_S = 0.5
@@ -72,38 +73,6 @@ TABLE = {
 ENDED = frozenset({Stage.DOCKED, Stage.ABORTED, Stage.FAILED})
 TURNED = frozenset({Stage.APPROACH, Stage.PUSH, Stage.VERIFY, Stage.ALIGN})
 """Stages that apply the small turn after a jam."""
-
-
-class DockPlan(NamedTuple):
-    """A prepared dock: the geometry of the two faces and the resulting body."""
-
-    request: DockRequest
-    closes: tuple[DockRequest, ...]
-    """Every joint that the dock closes between the two bodies: more than one where it closes a ring."""
-    merged: Body
-    axis_t: np.ndarray
-    """(3,) outward normal of the target's face, target module frame."""
-    place_t: np.ndarray
-    """(3,) centre of the active module when docked, target module frame, m."""
-    q_ta: np.ndarray
-    """(4,) active module frame to target module frame when docked."""
-
-    @property
-    def pitch_m(self) -> float:
-        """Edge of a lattice cell."""
-        return float(np.linalg.norm(self.place_t))
-
-
-class UndockPlan(NamedTuple):
-    """A prepared undock: the two resulting bodies."""
-
-    opens: tuple[DockRequest, ...]
-    """Every joint between the two, the requested one first; `module` is on the side that leaves."""
-    stays: Body
-    """The body with the target module."""
-    leaves: Body
-    axis_b: np.ndarray
-    """(3,) unit vector along which it leaves, frame of the whole body."""
 
 
 class Errors(NamedTuple):
@@ -321,14 +290,3 @@ class DockingSequence:
         if self._turn == 0.0 or self.stage not in TURNED:
             return self.plan.q_ta
         return np.asarray(multiply(exp(self.plan.axis_t * self._turn), self.plan.q_ta))
-
-
-def module_in(body: Body, module: int) -> tuple[np.ndarray, np.ndarray]:
-    """Position (3,) of a module's centre in its body, m, and quaternion (4,) from module frame to body frame."""
-    i = body.modules.index(module)
-    return np.ascontiguousarray(body.r_bm[i]), np.ascontiguousarray(body.q_bm[i])
-
-
-def pose_of(estimate: Estimate, r_b: np.ndarray, q_b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of a module in the world from its body's estimate."""
-    return estimate.p_wb + rotate(estimate.q_wb, r_b), normalise(multiply(estimate.q_wb, q_b))

@@ -10,7 +10,7 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.body import Body
-from firmware_py.core.docking_sequence import DockPlan, UndockPlan, module_in, pose_of
+from firmware_py.core.docking_plan import DockPlan, UndockPlan, module_in, pose_of
 from firmware_py.core.rotations import V, conjugate, difference, exp, multiply, normalise, rotate, to_matrix
 from firmware_py.core.types import Estimate
 from firmware_py.description.parameters import Docking

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from firmware_py.core.docking_sequence import UndockPlan
+from firmware_py.core.docking_plan import UndockPlan
 from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.types import DockRequest
 from firmware_py.description.parameters import Docking

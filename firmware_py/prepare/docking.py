@@ -8,7 +8,7 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
-from firmware_py.core.docking_sequence import DockPlan, UndockPlan
+from firmware_py.core.docking_plan import DockPlan, UndockPlan
 from firmware_py.core.joints import joints_of, modules_of, turned
 from firmware_py.core.types import DockRequest
 from firmware_py.description.schema import DescriptionError

@@ -12,7 +12,7 @@ from firmware_py.app.preparation import prepare
 from firmware_py.app.replay import DueWorker
 from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Prepared
-from firmware_py.core.docking_sequence import UndockPlan
+from firmware_py.core.docking_plan import UndockPlan
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.types import DockRequest, Inputs, ModuleInputs, Outputs, PartRequest
 from firmware_py.description.fleet import Fleet, Module
