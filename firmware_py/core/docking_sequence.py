@@ -54,8 +54,9 @@ class Row(NamedTuple):
     limit_s: str = ""
     """Name of the field of `Docking` that holds the timeout; empty: none."""
     on_timeout: Stage = Stage.ABORTED
-    on_done: Stage = Stage.ABORTED
-    """The stage that follows on completion."""
+    """The stage that follows when the limit has passed."""
+    on_done: Stage | None = None
+    """The stage that follows on completion (`_is_done`); None: only a dock, the limit or an abort ends the stage."""
 
 
 TABLE = {
@@ -188,6 +189,7 @@ class DockingSequence:
     # ------------------------------------------------------------ transitions
 
     def _decide(self, time_ns: int, active: Estimate, target: Estimate, errors: Errors, status: PairStatus, waits: bool) -> None:
+        """Enters the stage that follows if the faces are docked, an estimate is too uncertain, a limit has passed, or the stage is done."""
         if self.stage in ENDED:
             return
         if status.docked and TABLE[self.stage].relay == RELAY_PULL:  # while the magnets push, faces that are still near are not docked
@@ -203,10 +205,11 @@ class DockingSequence:
             self.abort(time_ns, f"{self._too_long}, waiting for another body")
         elif row.limit_s and time_ns - self._entered_ns - self._waited_ns > getattr(self._p, row.limit_s) * 1e9:
             self._time_out(time_ns, status)
-        elif not waits and self._is_done(time_ns, errors, status):  # a waiting body is still on its way, even where it passes the end
-            self._enter(row.on_done, time_ns)
+        elif row.on_done is not None and not waits and self._is_done(time_ns, errors, status):
+            self._enter(row.on_done, time_ns)  # not while it waits: it is still on its way then, even where it passes the end
 
     def _is_done(self, time_ns: int, errors: Errors, status: PairStatus) -> bool:
+        """Whether the stage has reached its aim. That of VERIFY is a dock, which `_decide` sees first; RELEASE lasts for its time."""
         p = self._p
         if self.stage == Stage.PRE_APPROACH:
             placed = abs(errors.gap_m - p.standoff_m) < 5 * p.align_m and errors.lateral_m < 5 * p.align_m
@@ -234,6 +237,7 @@ class DockingSequence:
         return f"{self.stage.name} took longer than {self._p.timeout_s:.0f} s"
 
     def _time_out(self, time_ns: int, status: PairStatus) -> None:
+        """Enters the stage after the limit, and notes why: a jam, tried again as often as permitted, or a stage that took too long."""
         if TABLE[self.stage].on_timeout == Stage.RELEASE:
             only = "current alone" if status.current else "position alone" if status.position else "neither condition"
             unseen = f", pictures of both are too few or older than {self._p.pose_fresh_ms:.0f} ms (DOCK_POSE_AGE)"
