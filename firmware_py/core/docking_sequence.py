@@ -84,7 +84,7 @@ class Errors(NamedTuple):
     angle_rad: float
 
 
-class Steering(NamedTuple):
+class SequenceOutputs(NamedTuple):
     """Outputs of the sequence in one tick."""
 
     active: Setpoint | Wish
@@ -124,7 +124,7 @@ class DockingSequence:
         self._last_ns = time_ns
         self._turn = 0.0
 
-    def step(self, time_ns: int, active: Estimate, target: Estimate, status: PairStatus, waits: Wish | None = None) -> Steering:
+    def step(self, time_ns: int, active: Estimate, target: Estimate, status: PairStatus, waits: Wish | None = None) -> SequenceOutputs:
         """Advances the sequence by one tick. `waits`: given while another body blocks the way; the active body glides by it instead until
         it stands before the target's face. If it leads to a place, to make room, the body also retreats from before the face.
         """
@@ -142,7 +142,7 @@ class DockingSequence:
         self._gap_m = float(np.clip(self._gap_m + speed * (passed_ns * 1e-9), -self._p.push_m, self._farthest_m))
         setpoint = self._setpoint(self.target_to_meet(target), speed, waits)
         is_apart = self._gap_m >= self._p.standoff_m
-        return Steering(setpoint, TABLE[self.stage].relay, is_apart, None if self.stage in ENDED else meets)
+        return SequenceOutputs(setpoint, TABLE[self.stage].relay, is_apart, None if self.stage in ENDED else meets)
 
     def abort(self, time_ns: int, reason: str) -> None:
         """Aborts the dock; both bodies hold apart."""

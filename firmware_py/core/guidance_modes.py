@@ -47,23 +47,23 @@ class Keep(IntEnum):
     ALL = 2
 
 
-class Steering(NamedTuple):
-    """Parts of the controller's force and moment that a mode uses."""
+class Controlled(NamedTuple):
+    """Parts of force and moment that the controller commands in a mode; sticks command the rest."""
 
     force: Keep
     moment: Keep
 
 
-STEERING = {
-    Mode.MANUAL: Steering(Keep.NOTHING, Keep.NOTHING),
-    Mode.STABILIZE: Steering(Keep.NOTHING, Keep.ALL),
-    Mode.ALT_HOLD: Steering(Keep.VERTICAL, Keep.ALL),
-    Mode.POSHOLD: Steering(Keep.ALL, Keep.ALL),
-    Mode.AUTO: Steering(Keep.ALL, Keep.ALL),
-    Mode.GUIDED: Steering(Keep.ALL, Keep.ALL),
-    Mode.DOCK: Steering(Keep.ALL, Keep.ALL),
-    Mode.SURFACE: Steering(Keep.ALL, Keep.ALL),
-    Mode.MOTOR_DETECT: Steering(Keep.NOTHING, Keep.NOTHING),
+CONTROLLED = {
+    Mode.MANUAL: Controlled(Keep.NOTHING, Keep.NOTHING),
+    Mode.STABILIZE: Controlled(Keep.NOTHING, Keep.ALL),
+    Mode.ALT_HOLD: Controlled(Keep.VERTICAL, Keep.ALL),
+    Mode.POSHOLD: Controlled(Keep.ALL, Keep.ALL),
+    Mode.AUTO: Controlled(Keep.ALL, Keep.ALL),
+    Mode.GUIDED: Controlled(Keep.ALL, Keep.ALL),
+    Mode.DOCK: Controlled(Keep.ALL, Keep.ALL),
+    Mode.SURFACE: Controlled(Keep.ALL, Keep.ALL),
+    Mode.MOTOR_DETECT: Controlled(Keep.NOTHING, Keep.NOTHING),
 }
 
 
@@ -185,7 +185,7 @@ class Guidance:
         return self._goal or Wish(ZERO, ZERO, at.p_wb, at.q_wb)
 
     def _enter(self, mode: Mode, time_ns: int, estimate: Estimate) -> None:
-        if STEERING[self.mode] != STEERING[Mode.POSHOLD]:
+        if CONTROLLED[self.mode] != CONTROLLED[Mode.POSHOLD]:
             self._glider.put(at_estimate(estimate))
         self._go_on(estimate)
         self._trajectory = self._goal = self._docking = None
@@ -228,7 +228,7 @@ class Guidance:
         now = self._glider.step(wish, dt_s)
         was_unplaced, self._was_unplaced = self._was_unplaced, not self._placed(health)
         # when tags return, the set-point follows the body for one more tick
-        if STEERING[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and (was_unplaced or self._was_unplaced)):
+        if CONTROLLED[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and (was_unplaced or self._was_unplaced)):
             now = self._follow_body(now, estimate)
         return now, ahead_of(now, self._lead_s)
 
@@ -294,7 +294,7 @@ class Guidance:
     def _follow_body(self, setpoint: Setpoint, estimate: Estimate) -> Setpoint:
         """Moves the set-point along with the body where position is not held: horizontally, or in all axes."""
         p_wb = estimate.p_wb.copy()
-        if STEERING[self.mode].force != Keep.NOTHING:
+        if CONTROLLED[self.mode].force != Keep.NOTHING:
             p_wb[2] = setpoint.p_wb[2]
         moved = setpoint._replace(p_wb=p_wb)
         self._glider.put(moved)
@@ -338,7 +338,7 @@ class Guidance:
     def _kept(self, wrench: np.ndarray, time_ns: int, estimate: Estimate, health: Health) -> np.ndarray:
         if self.mode == Mode.SURFACE:
             return self._surfacing(wrench, estimate, health)
-        force, moment = STEERING[self.mode]
+        force, moment = CONTROLLED[self.mode]
         out = wrench.copy()
         if (force, moment) == (Keep.ALL, Keep.ALL):
             return out

@@ -4,7 +4,7 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
-from firmware_py.core.docking_sequence import DockingSequence, Stage, Steering
+from firmware_py.core.docking_sequence import DockingSequence, SequenceOutputs, Stage
 from firmware_py.core.rotations import from_euler, multiply, rotate, to_matrix
 from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import DockRequest, Estimate
@@ -52,13 +52,13 @@ class Follower:
         self.at = estimate(self.face + 0.5 * self.outward)._replace(q_wb=TILTED)
         self.tick = 0
 
-    def step(self, status: PairStatus = NEITHER, waits: Wish | None = None) -> Steering:
+    def step(self, status: PairStatus = NEITHER, waits: Wish | None = None) -> SequenceOutputs:
         self.tick += 1
         steering = self.sequence.step(self.tick * TICK_NS, self.at, self.there, status, waits)
         self.at = self.at._replace(p_wb=steering.active.p_wb, q_wb=steering.active.q_wb)
         return steering
 
-    def until(self, stage: Stage, status: PairStatus = NEITHER) -> Steering:
+    def until(self, stage: Stage, status: PairStatus = NEITHER) -> SequenceOutputs:
         while self.tick < 8000:
             steering = self.step(status)
             if self.sequence.stage == stage:
