@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from firmware_py.app.preparation import prepare, wish_of
+from firmware_py.app.preparation import job_key, prepare
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.bus.mapping import InputCollector, OutputEncoder
 from firmware_py.bus.port import PortError, check_kind
@@ -66,7 +66,7 @@ class Firmware:
         inputs.prepared = self.worker.results()
         outputs = self.pipeline.step(inputs)
         for request in outputs.preparations:
-            kind, body = wish_of(request, self.pipeline.bodies)
+            kind, body = job_key(request, self.pipeline.bodies)
             job = partial(prepare, request, kind, self.pipeline, self.vehicles, self.fleet.pitch_m)
             self.worker.submit(job, (kind, body), first=isinstance(request, PartRequest))
         return outputs

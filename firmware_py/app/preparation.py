@@ -19,25 +19,25 @@ DONE_SINCE = {"dock": "a dock was asked for, and they have docked since", "undoc
 event names."""
 
 
-def wish_of(request: DockRequest | PartRequest, bodies: Sequence[Body]) -> tuple[str, int | None]:
-    """Key of a request for the worker: its kind, and the index of the body. A newer request with the same key replaces a waiting one."""
+def job_key(request: DockRequest | PartRequest, bodies: Sequence[Body]) -> tuple[str, int | None]:
+    """Key of a request's job for the worker: its kind, and the index of the body. A newer job with the same key replaces a waiting one."""
     joint = request.joints[0] if isinstance(request, PartRequest) else request
     of_body = {module: body for body in bodies for module in body.modules}
     body = of_body.get(joint.module)
     together = body is of_body.get(joint.target_module)
-    what = "part" if joint is not request else "undock" if together else "dock"
-    return what, None if body is None else body.index
+    kind = "part" if joint is not request else "undock" if together else "dock"
+    return kind, None if body is None else body.index
 
 
 def prepare(request: DockRequest | PartRequest, kind: str, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
     """The plan for `request`, or the reason why there is none; never raises for an infeasible request.
 
     Args:
-        kind: that of `wish_of` when it was made. Repeated before its modules docked, a dock would otherwise be planned as their undock.
+        kind: that of its `job_key` when it was made. Repeated before its modules docked, a dock would otherwise be planned as their undock.
         vehicles: by fleet index.
     """
     present = pipeline.bodies  # once: the loop runs meanwhile, and may join or part them
-    if not isinstance(request, PartRequest) and wish_of(request, present)[0] != kind:
+    if not isinstance(request, PartRequest) and job_key(request, present)[0] != kind:
         return Prepared(request, None, (), DONE_SINCE[kind])
     bodies = {module: body for body in present for module in body.modules}
     if isinstance(request, PartRequest):

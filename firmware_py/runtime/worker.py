@@ -1,7 +1,7 @@
 """Runs slow work beside the loop; a result returns as an input of a later tick. In lockstep the work runs inline.
 
 Jobs run one at a time and start only inside `submit` or `results`. The results that the ticks took therefore determine which jobs ran,
-and a replay runs the same ones. At most one job per wish waits.
+and a replay runs the same ones. At most one job per key waits.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ class Worker(ABC):
         self._waiting: dict[Hashable, Job] = {}
         self._is_busy = False
 
-    def submit(self, job: Job, wish: Hashable, first: bool = False) -> None:
+    def submit(self, job: Job, key: Hashable, first: bool = False) -> None:
         """Starts `job` now or later; never blocks for long in a real-time worker. A job must not raise.
 
         Args:
-            wish: purpose of the job. A waiting job with the same wish is replaced; a job that has started is finished.
+            key: what the job is for. A waiting job with the same key is replaced; a job that has started is finished.
             first: the job goes before all waiting ones.
         """
-        self._waiting = {wish: job, **self._waiting} if first else self._waiting
-        self._waiting[wish] = job
+        self._waiting = {key: job, **self._waiting} if first else self._waiting
+        self._waiting[key] = job
         self._begin_next()
 
     def results(self) -> list[Any]:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.polynomial.polynomial import polyval
 from scipy.spatial.transform import Rotation
 
-from firmware_py.app.preparation import prepare, wish_of
+from firmware_py.app.preparation import job_key, prepare
 from firmware_py.core import propagation
 from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Prepared
@@ -202,7 +202,7 @@ class FaultyTank(Tank):
         self._plans = [each for each in self._plans if each[0] > inputs.tick]
         outputs = self._step(inputs)
         for request in outputs.preparations:
-            plan = prepare(request, wish_of(request, self.pipeline.bodies)[0], self.pipeline, [MODCUBE] * len(inputs.modules), PITCH_M)
+            plan = prepare(request, job_key(request, self.pipeline.bodies)[0], self.pipeline, [MODCUBE] * len(inputs.modules), PITCH_M)
             self._plans.append((inputs.tick + 1 + self._delay, plan))
         self.event_log += [(1e-9 * inputs.time_ns, event.text) for event in outputs.events]
         return outputs

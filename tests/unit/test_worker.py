@@ -1,4 +1,4 @@
-"""Jobs that wait beside the loop: at most one per wish, urgent ones first, and the same ones in a replay."""
+"""Jobs that wait beside the loop: at most one per key, urgent ones first, and the same ones in a replay."""
 
 import threading
 from collections.abc import Iterator
@@ -44,7 +44,7 @@ class Slow(Worker):
 
 
 def submit(worker: Worker, *names: str) -> None:
-    """Submits jobs whose results are their names. The letters of a name are the wish; a final `!` makes the job go first."""
+    """Submits jobs whose results are their names. The letters of a name are the key; a final `!` makes the job go first."""
     for name in names:
         worker.submit(lambda name=name: name, name.rstrip("!0123456789"), first=name.endswith("!"))  # type: ignore[misc]
 
