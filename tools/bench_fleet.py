@@ -18,8 +18,6 @@ import numpy as np
 
 from firmware_py.core import propagation
 from firmware_py.core.body import Body
-from firmware_py.core.measurements import ATMOSPHERE_PA
-from firmware_py.core.observation import GRAVITY
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import multiply, normalise, rotate, to_matrix
@@ -27,7 +25,7 @@ from firmware_py.core.thruster import ThrusterLag
 from firmware_py.core.types import CHANNELS, Action, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
-from firmware_py.description.water import WATER_DENSITY
+from firmware_py.description.water import ATMOSPHERE_PA, GRAVITY, PA_PER_M
 from firmware_py.prepare.assembly import assemble
 from firmware_py.runtime.realtime import quiet_garbage
 
@@ -91,7 +89,7 @@ class FleetInWater:
         found.accel = self._turned[m] @ felt + SIGMA_ACCEL * noise[3:]
         if tick % DEPTH_EVERY == 0:
             depth_m = float(self.x[2] + body.r_bi[m] @ down)
-            found.pressure_pa = ATMOSPHERE_PA + WATER_DENSITY * GRAVITY * depth_m
+            found.pressure_pa = ATMOSPHERE_PA + PA_PER_M * depth_m
         if tick % ESC_EVERY == m % ESC_EVERY:
             found.esc = [EscFeedback(i, (rpm[i], rpm[i + 1]), (0.1, 0.1), (0, 0)) for i in range(0, len(rpm), 2)]
         if tick % SLOW_EVERY == m % SLOW_EVERY:

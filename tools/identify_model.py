@@ -25,9 +25,9 @@ from identify_motion import Motion, filled
 from scipy.signal import lfilter
 
 from firmware_py.core.drag_lookup import look_up
-from firmware_py.core.observation import GRAVITY
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import ThrusterCurve, Vehicle
+from firmware_py.description.water import GRAVITY
 from firmware_py.prepare.assembly import assemble_vehicle
 
 HALF_WINDOW = 5

@@ -16,8 +16,8 @@ import numpy as np
 from identify_log import Recording
 from scipy.stats import chi2
 
-from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rotations import difference, exp, multiply, normalise, rotate, skew, to_matrix
+from firmware_py.description.water import GRAVITY
 
 STATES, ERRORS = 16, 15
 INITIAL_SIGMA = np.repeat([0.05, 0.3, 0.05, 0.05, 0.3], 3)

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from identify_fit import Fit
 
-from firmware_py.core.observation import GRAVITY
 from firmware_py.description.schema import frozen_array
 from firmware_py.description.vehicle import ThrusterCurve, Vehicle
+from firmware_py.description.water import GRAVITY
 from firmware_py.prepare.assembly import assemble_vehicle
 
 AXES = "xyz"

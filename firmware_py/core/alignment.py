@@ -11,9 +11,9 @@ import math
 import numpy as np
 
 from firmware_py.core.measurements import FLIP_RAD
-from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
 from firmware_py.core.types import BodyPose
+from firmware_py.description.water import GRAVITY
 
 AT_REST_M_S2 = 0.05 * GRAVITY
 """Largest difference in magnitude between mean specific force and gravity for a body at rest: nothing pushes it up or down. A sideways

@@ -19,13 +19,10 @@ from collections.abc import Sequence
 
 from firmware_py.core.body import Body
 from firmware_py.core.depth_datum import DepthDatum
-from firmware_py.core.measurements import ATMOSPHERE_PA
-from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rotations import to_matrix
 from firmware_py.core.types import BodyPose, ExpectedDepth, ModuleInputs
-from firmware_py.description.water import WATER_DENSITY
+from firmware_py.description.water import ATMOSPHERE_PA, PA_PER_M
 
-PA_PER_M = WATER_DENSITY * GRAVITY
 LEAST_PA = 60_000.0
 """Smallest pressure of a live sensor: that of the air 4200 m above the sea. Titicaca, at 3812 m, has 63 kPa."""
 MOST_RATING = 1.5

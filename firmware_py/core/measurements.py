@@ -9,18 +9,14 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.body import Body
-from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rotations import M, V, conjugate, cross, difference, exp, multiply, skew, to_matrix
 from firmware_py.core.sensor_offsets import SensorOffsets
 from firmware_py.core.types import BodyPose, Measured, ModuleInputs, TagObservation
-from firmware_py.description.water import WATER_DENSITY
+from firmware_py.description.water import ATMOSPHERE_PA, PA_PER_M
 
-ATMOSPHERE_PA = 101_325.0
-"""Standard atmosphere; the estimator's depth bias takes up changes by the weather."""
 FLIP_RAD = 0.35
 """Attitude difference beyond which a tag counts as flipped and is left out (20 deg; noise is 0.5): against the largest group of agreeing
 tags in its picture, and, before any tag was accepted, against the tilt by gravity."""
-
 SECOND_HAND = 0
 """Quality of a tag whose pose was measured relative to another one, by a camera on a module: the other's errors add to its own."""
 SECOND_HAND_WEIGHT = 1.0 / 9.0
@@ -147,9 +143,9 @@ class Measurements:
             return None
         which, down = [m.pressure_pa is not None for m in mine], to_matrix(q_wb)[2]
         pressure, below = sum(heard) / len(heard), float(self._lever(which).dot(down))
-        depth_m = (pressure - ATMOSPHERE_PA) / (WATER_DENSITY * GRAVITY) - below
+        depth_m = (pressure - ATMOSPHERE_PA) / PA_PER_M - below
         if len(mine) > 1:
-            each_m = (np.array(heard) - ATMOSPHERE_PA) / (WATER_DENSITY * GRAVITY) - self._r_bi[which] @ down
+            each_m = (np.array(heard) - ATMOSPHERE_PA) / PA_PER_M - self._r_bi[which] @ down
             depth_m -= self._depth_offset(which, each_m)
         return depth_m
 

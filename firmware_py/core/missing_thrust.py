@@ -15,14 +15,15 @@ from numba import njit
 
 from firmware_py.core.body import BUOYANCY_SIGMA_N, CRUISE_M_S, Body
 from firmware_py.core.drag_lookup import NODES, add_drag
-from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rigid_body import add_restoring, take_coriolis
 from firmware_py.core.rotations import M, V, cross, rotate_back, turned_back
 from firmware_py.core.thruster_trial import ThrusterTrial
 from firmware_py.core.trial_handover import Held, carried_over
 from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
+from firmware_py.description.water import GRAVITY
 
+DOWN = np.array([0.0, 0.0, 1.0])
 BLOCK_NS = 100_000_000
 """Length of an averaging block."""
 RECENT, GAP, BASE = 5, 12, 30
@@ -162,7 +163,7 @@ class MissingThrust:
             rest = self._body.mass @ motion - acted - (model + coriolis) / n
             self._whole = min(self._whole + 1, BASE)
             self._residual = self._residual + (rest - self._residual) / self._whole
-        down_b = rotate_back(estimate.q_wb, DOWN / GRAVITY)
+        down_b = rotate_back(estimate.q_wb, DOWN)
         self._blocks[:-1] = self._blocks[1:]
         doubts = [max(estimate.sigma_q.tolist()), speed / n]
         self._blocks[-1] = np.concatenate([rest, acted, down_b, coriolis / n, flow / n, forces / n, doubts])
@@ -217,9 +218,6 @@ class MissingThrust:
     def _explain(self, alive: np.ndarray) -> int:
         """Returns the one thruster that explains the change, or -1."""
         return int(explain(self._blocks, self._columns, alive, *self._healthy, self.parameters.lie_share))
-
-
-DOWN = np.array([0.0, 0.0, GRAVITY])
 
 
 @njit(f"void({V},{NODES},{V},{V},{V},{V},{V})", cache=True)

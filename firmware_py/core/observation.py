@@ -13,9 +13,8 @@ from numba import njit
 
 from firmware_py.core.propagation import ERRORS, PLANT, STATE, carry, inertial_acceleration, inject, predict, squared_speeds
 from firmware_py.core.rotations import M, V, difference, rotate_back, skew, to_matrix
+from firmware_py.description.water import GRAVITY
 
-GRAVITY = 9.80665
-"""m/s^2, standard gravity."""
 ANY_NIS = math.inf
 MOST_SPEED_M_S, MOST_RATE_RAD_S = 10.0, 30.0
 """A state beyond these has diverged, and the filter begins anew. No thruster vehicle swims faster than a few m/s, in currents of up to two;

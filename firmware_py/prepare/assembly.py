@@ -13,10 +13,10 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.core.body import ARM_SIGMA_M, BUOYANCY_SIGMA_N, TRIM_SIGMA_M, Body, ThrusterSet, can_make
-from firmware_py.core.observation import GRAVITY
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import AXES, MOST_THRUSTERS, Vehicle, too_many_thrusters
+from firmware_py.description.water import GRAVITY
 from firmware_py.prepare import drag_table
 from firmware_py.prepare.drag_cache import DragCache
 from firmware_py.prepare.joints import Placement, check_joints

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from firmware_py.core.depth_gate import DOUBT, LEAST_GATE_M, MOST_SPEED_M_S, MOST_STEP_M, PA_PER_M, SETTLED, DepthGate
-from firmware_py.core.measurements import ATMOSPHERE_PA
+from firmware_py.core.depth_gate import DOUBT, LEAST_GATE_M, MOST_SPEED_M_S, MOST_STEP_M, SETTLED, DepthGate
 from firmware_py.core.types import ExpectedDepth, Mode, ModuleInputs
 from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.water import ATMOSPHERE_PA, PA_PER_M
 from firmware_py.prepare.assembly import assemble
 from tests.unit.estimated_robot import P_WB, PERIOD, Robot, sensors
 from tests.unit.tanks import DT, Tank, flies_with_noise, single

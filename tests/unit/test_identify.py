@@ -15,13 +15,13 @@ import identify_quantities as quantities
 import numpy as np
 import pytest
 
-from firmware_py.core.observation import GRAVITY
 from firmware_py.core.rotations import exp, rotate, rotate_back
 from firmware_py.core.types import BodyPose
 from firmware_py.description.parameters import Estimation
 from firmware_py.description.schema import DescriptionError, build, frozen_array, read_toml
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import Payload, Vehicle, load_vehicle, vehicle_names
+from firmware_py.description.water import GRAVITY
 from firmware_py.prepare.assembly import assemble_vehicle
 from hil.scenario import load_scenario
 
