@@ -153,8 +153,11 @@ class Watch:
         self._told_ns = self._since_ns if on and all(watch._told_ns == watch._since_ns for watch in on) else None
 
     def beyond(self, health: Health) -> bool:
-        """Whether the figure is beyond its limit now, in any mode. A NaN is not."""
-        value = getattr(health, self.row.figure)
+        """Whether the figure is beyond its limit now, in any mode."""
+        return self.is_bad(getattr(health, self.row.figure))
+
+    def is_bad(self, value: float) -> bool:
+        """Whether a value of the figure is beyond its limit. A NaN is not."""
         return bool(value < self.limit if self.row.below else value > self.limit)
 
     def counts(self, mode: Mode, forced: bool, armed: bool) -> bool:
@@ -230,7 +233,7 @@ class Failsafes:
         """
         alarms = []
         for watch, value in zip(self._all, get_figures(health), strict=True):
-            cause = (value < watch.limit if watch.row.below else value > watch.limit) and watch.counts(mode, forced, armed)
+            cause = watch.is_bad(value) and watch.counts(mode, forced, armed)
             if not cause and not watch.active and watch._since_ns is None:
                 continue
             was_active = watch.active
