@@ -1,5 +1,4 @@
-"""Table of arming checks, each with its reason in words, and the check of what each mode needs. Only the supervisor uses them.
-"""
+"""Table of arming checks, each with its reason in words, and the check of what each mode needs. Only the supervisor uses them."""
 
 from __future__ import annotations
 
@@ -123,8 +122,8 @@ def _warm(q: Question) -> str:
     return "" if q.health.warm else "compiled code is not warm yet"
 
 
-def _topology(q: Question) -> str:
-    return q.health.topology
+def _joints(q: Question) -> str:
+    return q.health.open_joint_words
 
 
 CHECKS = (
@@ -144,7 +143,7 @@ CHECKS = (
     Check("every axis has thrust", _thrusters, True),
     Check("no fail-safe on", _failsafes, True),
     Check("few bad frames", _frames, True),
-    Check("topology as configured", _topology, True),
+    Check("topology as configured", _joints, True),
 )
 
 

@@ -109,7 +109,7 @@ class Formation:
             if not pipeline.joints or pipeline.body.index in parted:
                 continue
             mine = [joint for joint in loose if joint.module in pipeline.body.modules]
-            pipeline.health.topology, pipeline.health.open_joints = _words_of(mine), tuple(map(modules_of, mine))
+            pipeline.health.open_joint_words, pipeline.health.open_joints = _words_of(mine), tuple(map(modules_of, mine))
             gone = [joint for joint in apart if joint.module in pipeline.body.modules]
             pipeline.parting = pipeline.parting if gone else []  # a joint that closes briefly may drop its plan: ask again when it opens
             if gone and gone != pipeline.parting and pipeline.supervisor.armed and pipeline.supervisor.is_on("partner_lost"):

@@ -72,8 +72,8 @@ class Health(NamedTuple):
     """Rank lost from the thruster matrix because of unusable thrusters."""
     warm: bool
     """Whether every stage has run at least once."""
-    topology: str
-    """Which docked partner is lost, in words; empty: none."""
+    open_joint_words: str
+    """Which modules should hold each other but do not, for people; empty: none."""
     tag_gap_s: float = math.nan
     """Time between the last two tag pictures, accepted or not; NaN while none come."""
     battery_age_s: float = 0.0
@@ -82,7 +82,6 @@ class Health(NamedTuple):
     """The same for cabin readings, whose frame carries the leak sensor too."""
     unfit: tuple[int, ...] = ()
     """Fleet indices of modules that report starting up, or a fault."""
-
     open_joints: tuple[frozenset[int], ...] = ()
     """Modules of each joint that is open although it should hold."""
     push_m_s: float = 0.0
@@ -114,7 +113,7 @@ class Health(NamedTuple):
     @property
     def partner_lost(self) -> bool:
         """Whether a docked partner is lost."""
-        return self.topology != ""
+        return self.open_joint_words != ""
 
     @property
     def thruster_lost(self) -> bool:

@@ -15,7 +15,7 @@ FIELDS: dict[str, str] = {
     "leak": "leak", "bus_silent": "bus_silent_s", "foreign_sync": "foreign_sync",
     "foreign_command": "foreign_command", "battery_critical": "voltage_share",
     "cabin_hot": "cabin_c", "cabin_pressure": "cabin_change_pa", "axis_lost": "lost_axes", "depth_unknown": "",
-    "tag_gone": "tag_age_s", "partner_lost": "topology", "estimator": "nis_ratio", "rejected": "rejected_share",
+    "tag_gone": "tag_age_s", "partner_lost": "open_joint_words", "estimator": "nis_ratio", "rejected": "rejected_share",
     "tag_lost": "tag_age_s", "pushed": "push_m_s", "tag_late": "tag_age_s",
     "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s",
     "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "collision": "collision_s", "ground_lost": "ground_age_s",

@@ -64,7 +64,7 @@ SOFT: list[tuple[Health, str]] = [
     (GOOD._replace(lost_axes=1), "the thrusters left cannot make every wrench"),
     (GOOD._replace(without_thrust=("pitch",)), "pitch has no thrust: declare it in passive_dof of the vehicle file, or add thrusters"),
     (GOOD._replace(frame_errors_per_s=21.0), "21 bad frames a second, 20 permitted"),
-    (GOOD._replace(topology="module 2 is not docked as configured"), "module 2 is not docked as configured"),
+    (GOOD._replace(open_joint_words="module 2 is not docked as configured"), "module 2 is not docked as configured"),
 ]
 
 

@@ -47,11 +47,11 @@ def test_pilot_takes_over_and_keeps_it_while_the_leak_lasts() -> None:
     ("bad", "against"),
     [
         (
-            GOOD._replace(topology="0 and 1", open_joints=(modules_of(DOCK),)),
+            GOOD._replace(open_joint_words="0 and 1", open_joints=(modules_of(DOCK),)),
             {Action.DOCK: "a docked partner is lost", Action.UNDOCK: ""},
         ),
         (
-            GOOD._replace(topology="1 and 2", open_joints=(frozenset((1, 2)),)),
+            GOOD._replace(open_joint_words="1 and 2", open_joints=(frozenset((1, 2)),)),
             {Action.DOCK: "a docked partner is lost", Action.UNDOCK: "a docked partner is lost"},
         ),
         (GOOD._replace(leak=True), {Action.DOCK: "water in a cabin", Action.UNDOCK: "water in a cabin"}),
