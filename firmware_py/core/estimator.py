@@ -33,6 +33,8 @@ from firmware_py.description.parameters import Estimation
 
 READY_AFTER = 10
 """Tag observations to accept before the pose counts as valid."""
+NOWHERE = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+"""Position and attitude that are believed before anything is measured."""
 UNKNOWN_SIGMA = np.full(6, 1e3)
 """Sigma of the pose before the first tag, m and rad."""
 UPRIGHT_AFTER_S = 1.0
@@ -53,7 +55,7 @@ NORTH_DENSITY = 1e-4
 known by definition. Without this the filter fitted the heading to noise: a bump turned the estimate by a third of a circle."""
 KEPT_STATES = np.r_[Nominal.RATE, Nominal.GYRO_BIAS, Nominal.ACCEL_BIAS, Nominal.VERTICAL_FORCE, Nominal.MOMENT, Nominal.RIGHTING]
 """Indices of what survives in the state when tags relocate a body that was adrift, because it does not depend on the heading."""
-WAY_S = 0.01
+UNDER_WAY_S = 0.01
 """Sample period for which `accel_under_way` gives the error of one sample. A wrong mass causes the same error in all samples within that
 time, so that more samples carry no more information."""
 LEARNT, LEARNT_ERRORS, LEARNT_SIGMAS = np.r_[Nominal.MOMENT, Nominal.RIGHTING], np.r_[Error.MOMENT, Error.RIGHTING], 5.0
@@ -88,17 +90,23 @@ class Estimator:
         self._plant = body.plant
         self._dt = period_ns * 1e-9
         self._history = History(period_ns)
-        self._now = np.eye(1, STATES, 3)[0]
+        self._now = NOWHERE
+        """State at the time of the last tick; without an estimate the last believed pose, at rest."""
         self._anchor: Belief
         self._head: Belief
+        self._accepted: int
+        """Tag observations accepted since the estimate started, 0: there is no estimate; a start without tags counts as READY_AFTER."""
+        self._waited_ticks: int
+        """Ticks without an estimate."""
         self._forget()
         self.retune(parameters)
-        self._refused_in_row = 0
-        self._rejected, self._depth_variance = 0, math.inf
+        self._refused_in_row, self._rejected = 0, 0
+        self._depth_variance = math.inf
         self._last_tag_ns, self._last_accept_ns = NEVER_NS, 0
-        self._tag_agreement, self._last_accel_ns, self._last_depth_ns = TagAgreement(), 0, 0
-        self._nis = math.nan
-        self._nis_dof = 0
+        """Capture time of the newest accepted tag, and time of the tick in which it was accepted or the estimate started."""
+        self._last_accel_ns, self._last_depth_ns = 0, 0
+        self._tag_agreement = TagAgreement()
+        self._nis, self._nis_dof = math.nan, 0
         self.fused: list[BodyPose] = []
         """Pictures that the last tick accepted."""
 
@@ -108,10 +116,8 @@ class Estimator:
         self._density = self._process_noise()
         drag_walk = p.current_walk * self._body.drag.cruise_slope / CRUISE_M_S
         reach_m = self._body.reach_m
-        accel_way = p.accel_under_way * math.sqrt(WAY_S / self._dt)
-        self._under_way = np.array([
-            drag_walk, drag_walk * reach_m, p.alpha_turning, accel_way, accel_way * reach_m,
-        ])  # fmt: skip
+        accel = p.accel_under_way * math.sqrt(UNDER_WAY_S / self._dt)
+        self._under_way = np.array([drag_walk, drag_walk * reach_m, p.alpha_turning, accel, accel * reach_m])
         self._inertial_sigma = np.array([p.gyro_sigma, p.accel_sigma, p.depth_sigma_m])
         self._tag_variance = np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3]) ** 2
 
@@ -140,7 +146,7 @@ class Estimator:
         """
         self._nis, self._nis_dof, self.fused = math.nan, 0, []
         if self._history.newest >= 0 and time_ns - self._history.newest_ns > WINDOW_NS:
-            self._accepted = self._waited = 0  # the process was suspended: the history does not reach back to the anchor
+            self._accepted = self._waited_ticks = 0  # the process was suspended: the history does not reach back to the anchor
         self._history.push(time_ns, tau, measured.gyro, measured.accel, measured.depth_m)
         self._last_accel_ns = time_ns if measured.accel is not None else self._last_accel_ns
         self._last_depth_ns = time_ns if measured.depth_m is not None else self._last_depth_ns
@@ -148,12 +154,12 @@ class Estimator:
             self._take(pose)
         if self._is_lost(time_ns):
             self._forget()
-            self._waited = round(UPRIGHT_AFTER_S / self._dt)  # no second wait: gravity is used at once
+            self._waited_ticks = round(UPRIGHT_AFTER_S / self._dt)  # no second wait: gravity is used at once
         if not self._accepted:
             self._wait(time_ns)
         if self._accepted:
             self._anchor = self._advanced(self._anchor, time_ns - WINDOW_NS)
-            self._lead(time_ns)
+            self._move_head(time_ns)
             if self._is_adrift:
                 self._anchor, self._head = self._stilled(self._anchor), self._stilled(self._head)
         return self._estimate(time_ns)
@@ -177,6 +183,7 @@ class Estimator:
     # ------------------------------------------------------------ fusion at the anchor
 
     def _take(self, pose: BodyPose) -> None:
+        """Starts from a tag picture, or advances the anchor to it and fuses it there; refuses one from before the anchor."""
         if not observation.are_finite(pose.p_wt, pose.q_wb):
             self._rejected += 1
         elif not self._accepted:
@@ -184,13 +191,14 @@ class Estimator:
         elif pose.capture_ns >= self._anchor.time_ns:
             self._anchor = self._advanced(self._anchor, min(pose.capture_ns, self._history.newest_ns))
             if self._is_adrift:
-                self._place(pose)
+                self._relocate(pose)
             else:
                 self._fuse_tag(pose)
         else:
             self._rejected += 1
 
     def _start(self, pose: BodyPose) -> None:
+        """Starts a new estimate: a body at rest at `pose`, with INITIAL_SIGMA, and no depth readings that contradict it."""
         x = np.zeros(STATES)
         x[Nominal.ATTITUDE] = pose.q_wb
         x[Nominal.POSITION] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
@@ -206,14 +214,14 @@ class Estimator:
 
     def _wait(self, time_ns: int) -> None:
         """Waits for a tag; after a second without any, starts levelled by gravity, at the last believed position and heading."""
-        self._waited += 1
-        if self._waited * self._dt <= UPRIGHT_AFTER_S:
+        self._waited_ticks += 1
+        if self._waited_ticks * self._dt <= UPRIGHT_AFTER_S:
             return
-        _, gyros, others = self._history.since(self._history.first_after(time_ns - GRAVITY_WINDOW_NS))
-        tilt = upright(gyros, others[:, :3])
+        _, gyros, accels_depths = self._history.since(self._history.first_after(time_ns - GRAVITY_WINDOW_NS))
+        tilt = upright(gyros, accels_depths[:, :3])
         if tilt is None:
             return
-        depths = others[~np.isnan(others[:, 3]), 3]
+        depths = accels_depths[:, 3][~np.isnan(accels_depths[:, 3])]
         place = np.r_[self._now[:2], depths.mean() if len(depths) else self._now[2]]
         self._start(BodyPose(time_ns, place, np.zeros(3), multiply(heading(self._now[Nominal.ATTITUDE]), tilt), 1.0))
         self._anchor.covariance[2, 2] = INITIAL_SIGMA[-1] ** 2 if len(depths) else UNKNOWN_SIGMA[2] ** 2
@@ -244,7 +252,7 @@ class Estimator:
         x, covariance = observation.fuse_stillness(at.x, at.covariance, STILL_DENSITY / self._dt, axes, north)
         return Belief(x, covariance, at.time_ns)
 
-    def _place(self, pose: BodyPose) -> None:
+    def _relocate(self, pose: BodyPose) -> None:
         """Relocates a body that was adrift once enough tags agree (`TagAgreement`); the state entries KEPT_STATES stay."""
         if not self._tag_agreement.agrees(pose, self._anchor.x[Nominal.POSITION], self._anchor.x[Nominal.ATTITUDE]):
             self._refuse(pose)
@@ -265,9 +273,9 @@ class Estimator:
             return start
         index = self._history.first_after(start.time_ns)
         first_ns = self._history.time_of(index)
-        count, rest_ns = divmod(to_ns - first_ns, self._history.period_ns)
-        count += 1
-        if count == 0:
+        periods, rest_ns = divmod(to_ns - first_ns, self._history.period_ns)
+        count = periods + 1  # samples up to `to_ns`
+        if count == 0:  # the first is later
             rest_ns = to_ns - start.time_ns
         x, covariance = observation.advance(
             start.x, start.covariance, *self._history.since(index), (first_ns - start.time_ns) * 1e-9, count, self._dt, rest_ns * 1e-9,
@@ -276,6 +284,7 @@ class Estimator:
         return Belief(x, covariance, to_ns)
 
     def _fuse_tag(self, pose: BodyPose) -> None:
+        """Fuses a picture at the anchor unless the gate refuses it."""
         gate, at = self._p.tag_gate**2, self._anchor
         seen = (pose.p_wt, pose.lever_b, pose.q_wb, self._tag_variance, pose.tags)
         nis, x, covariance = observation.fuse_tag(at.x, at.covariance, *seen, gate)
@@ -291,6 +300,7 @@ class Estimator:
         self._last_tag_ns, self._last_accept_ns = pose.capture_ns, self._history.newest_ns
 
     def _refuse(self, pose: BodyPose) -> None:
+        """Counts a refused picture; after RESET_AFTER in a row starts anew from it, with what is learnt of the body (LEARNT)."""
         self._rejected += 1
         self._refused_in_row += 1
         if self._refused_in_row >= RESET_AFTER:
@@ -301,7 +311,7 @@ class Estimator:
 
     # ------------------------------------------------------------ from the anchor to now
 
-    def _lead(self, time_ns: int) -> None:
+    def _move_head(self, time_ns: int) -> None:
         """Moves the head: equal to the anchor while tags come; otherwise it runs ahead, up to one period before now."""
         if time_ns - self._last_accept_ns < BLIND_NS:
             self._head = self._anchor
@@ -328,9 +338,9 @@ class Estimator:
 
     def _forget(self) -> None:
         """Drops the estimate: the filter restarts from the next tag, or levelled by gravity at the last believed position."""
-        self._accepted = self._waited = 0
+        self._accepted = self._waited_ticks = 0
         sound = observation.are_finite(self._now[Nominal.POSITION], self._now[Nominal.ATTITUDE])
-        self._now = np.r_[self._now[:7] if sound else np.eye(1, 7, 3)[0], np.zeros(STATES - 7)]
+        self._now = np.r_[self._now[: NOWHERE.size] if sound else NOWHERE, np.zeros(STATES - NOWHERE.size)]
         self._anchor = self._head = Belief(self._now, np.eye(ERRORS), 0)
 
     def _estimate(self, time_ns: int) -> Estimate:

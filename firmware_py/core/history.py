@@ -16,9 +16,9 @@ class History:
     def __init__(self, period_ns: int) -> None:
         self.period_ns = period_ns
         self.length = WINDOW_NS // period_ns + 2
-        self._rows = np.full((2 * self.length, 4), np.nan)
         self._tau = np.zeros((2 * self.length, 6))
         self._gyro = np.full((2 * self.length, 3), np.nan)
+        self._accel_depth = np.full((2 * self.length, 4), np.nan)
         self.newest = -1
         """Index of the newest sample, counted from the start."""
         self.newest_ns = 0
@@ -43,12 +43,12 @@ class History:
         both = slice(self.newest % self.length, None, self.length)
         self._tau[both] = tau
         self._gyro[both] = np.nan if gyro is None else gyro
-        self._rows[both, :3] = np.nan if accel is None else accel
-        self._rows[both, 3] = np.nan if depth_m is None else depth_m
+        self._accel_depth[both, :3] = np.nan if accel is None else accel
+        self._accel_depth[both, 3] = np.nan if depth_m is None else depth_m
 
     def forget_depths(self, depth_m: float, most_m: float) -> None:
         """Drops the kept depth readings that differ from a depth by more than `most_m`, both m: no estimate judged them when they came."""
-        self._rows[np.abs(self._rows[:, 3] - depth_m) > most_m, 3] = np.nan
+        self._accel_depth[np.abs(self._accel_depth[:, 3] - depth_m) > most_m, 3] = np.nan
 
     def time_of(self, index: int) -> int:
         """Returns the time of sample `index`, ns, counted back from the newest at the nominal period."""
@@ -63,4 +63,4 @@ class History:
         """Returns wrenches (k, 6), gyro readings (k, 3), and accelerometer and depth (k, 4) of the samples from `index` to the newest."""
         last = self.newest % self.length + self.length + 1
         first = last - (self.newest - index + 1)
-        return self._tau[first:last], self._gyro[first:last], self._rows[first:last]
+        return self._tau[first:last], self._gyro[first:last], self._accel_depth[first:last]

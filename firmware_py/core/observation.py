@@ -148,13 +148,13 @@ def fuse_inertial(  # type: ignore[no-untyped-def]
 
 @njit(f"{STATE}({V},{M},{M},{M},{M},float64,int64,float64,float64,{V},{V},{V},{PLANT})", cache=True)
 def advance(  # type: ignore[no-untyped-def]
-    x, covariance, taus, gyros, others, first, count, dt, rest, density, under_way, sigma,
+    x, covariance, taus, gyros, accels_depths, first, count, dt, rest, density, under_way, sigma,
     mass, mass_inv, righting, nodes, rotational, linear,
 ):  # fmt: skip
     """Returns state and covariance advanced through stored samples, each fused at its time.
 
     Args:
-        taus: (k, 6), gyros: (k, 3), others: (k, 4) accelerometer and depth, of each tick, NaN where missing.
+        taus: (k, 6), gyros: (k, 3), accels_depths: (k, 4) accelerometer and depth, of each tick, NaN where missing.
         first: time to the first sample, s; count: samples to fuse; dt: time between them, s; rest: time left after the last, s.
         density, under_way: as in `predict`. sigma: (3,) as in `inertial`.
     """
@@ -162,14 +162,14 @@ def advance(  # type: ignore[no-untyped-def]
         tau, elapsed = taus[i], first if i == 0 else dt
         x, covariance = predict(x, covariance, tau, elapsed, density, under_way, mass, mass_inv, righting, nodes, rotational, linear)
         x, covariance = fuse_inertial(
-            x, covariance, tau, gyros[i], others[i, :3], others[i, 3], elapsed, dt, density, under_way, sigma,
+            x, covariance, tau, gyros[i], accels_depths[i, :3], accels_depths[i, 3], elapsed, dt, density, under_way, sigma,
             mass, mass_inv, righting, nodes, rotational, linear,
         )  # fmt: skip
     if rest > 0.0:
         tau = taus[count]
         x, covariance = predict(x, covariance, tau, rest, density, under_way, mass, mass_inv, righting, nodes, rotational, linear)
         x, covariance = fuse_inertial(
-            x, covariance, tau, np.full(3, math.nan), others[count, :3], math.nan, rest, dt, density, under_way, sigma,
+            x, covariance, tau, np.full(3, math.nan), accels_depths[count, :3], math.nan, rest, dt, density, under_way, sigma,
             mass, mass_inv, righting, nodes, rotational, linear,
         )  # fmt: skip
     return x, covariance
