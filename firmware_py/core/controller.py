@@ -31,7 +31,7 @@ class Controller:
         self._kd = np.repeat(
             [2 * p.position_damping * p.position_bandwidth, 2 * p.attitude_damping * p.attitude_bandwidth], 3
         )
-        self._law = np.array([float(p.law == "model"), p.drag_feedforward, p.disturbance_feedforward])
+        self._law = p.law == "model", p.drag_feedforward, p.disturbance_feedforward
 
     def step(self, now: Setpoint, ahead: Setpoint, estimate: Estimate) -> np.ndarray:
         """Returns the wanted wrench, (6,), body frame.
@@ -44,7 +44,7 @@ class Controller:
         e = estimate
         return np.asarray(
             _wrench(
-                *now, *ahead, e.p_wb, e.q_wb, e.nu, e.force_w, e.moment_b, self._kp, self._kd, self._law, *self._plant
+                *now, *ahead, e.p_wb, e.q_wb, e.nu, e.force_w, e.moment_b, self._kp, self._kd, *self._law, *self._plant
             )
         )
 
@@ -58,11 +58,18 @@ def _body_velocity(q_set, v_w, w_b, q):  # type: ignore[no-untyped-def]
     return out
 
 
-@njit(f"{V}({SETPOINT},{SETPOINT},{V},{V},{V},{V},{V},{V},{V},{V},{PLANT})", cache=True)
+@njit(f"{V}({SETPOINT},{SETPOINT},{V},{V},{V},{V},{V},{V},{V},boolean,float64,float64,{PLANT})", cache=True)
 def _wrench(  # type: ignore[no-untyped-def]
-    p0, q0, v0, w0, a0, alpha0, p1, q1, v1, w1, a1, alpha1, p, q, nu, force_w, moment_b, kp, kd, law,
+    p0, q0, v0, w0, a0, alpha0, p1, q1, v1, w1, a1, alpha1, p, q, nu, force_w, moment_b, kp, kd, is_model, drag_share, disturbance_share,
     mass, mass_inv, righting, nodes, rotational, linear,
 ):  # fmt: skip
+    """Returns the wanted wrench (6,), body frame.
+
+    Args:
+        p0 to alpha0, p1 to alpha1: set-points of this tick and ahead. p to moment_b: estimate. kp, kd: (6,) gains, before the mass matrix.
+        is_model: C and D are those of the wanted motion; else, by the paper's law, those of the present one, and g is zero.
+        drag_share, disturbance_share: shares of drag and disturbance that are fed forward.
+    """
     error = np.empty(6)
     error[:3] = rotate_back(q, p0 - p)
     error[3:] = difference(q0, q)
@@ -71,10 +78,10 @@ def _wrench(  # type: ignore[no-untyped-def]
     # w x v is subtracted because the Coriolis term contains it
     rate[:3] += rotate_back(q, a1) - cross(ahead[3:], ahead[:3])
     rate[3:] += rotate_back(q, rotate(q1, alpha1))
-    modelled = ahead if law[0] > 0.5 else nu
-    tau = mass @ rate + coriolis_wrench(mass, modelled) - law[1] * drag_wrench(nodes, rotational, linear, modelled)
-    tau[:3] -= law[2] * rotate_back(q, force_w)
-    tau[3:] -= law[2] * moment_b
-    if law[0] > 0.5:  # the paper's law takes g(eta) as zero
+    modelled = ahead if is_model else nu
+    tau = mass @ rate + coriolis_wrench(mass, modelled) - drag_share * drag_wrench(nodes, rotational, linear, modelled)
+    tau[:3] -= disturbance_share * rotate_back(q, force_w)
+    tau[3:] -= disturbance_share * moment_b
+    if is_model:
         tau[3:] -= restoring_moment(righting, q)
     return tau
