@@ -76,7 +76,6 @@ class Allocator:
     def __init__(self, body: Body, parameters: Allocation) -> None:
         self.parameters = parameters
         self._clip_only = parameters.mode == "pseudo_inverse"
-        self._least_power = parameters.mode == "least_power"
         self._thrusters = body.thrusters
         n = body.thrusters.f_max.size
         reach = np.maximum(body.thrusters.f_max, -body.thrusters.f_min)
@@ -84,6 +83,7 @@ class Allocator:
         self._most = np.array([np.linalg.norm(body.thrusters.matrix[rows], axis=0) @ reach for rows in (slice(0, 3), slice(3, 6))])
         self._smallest_n = 0.0 if self._clip_only else parameters.preload_n
         self._preloaded: tuple[np.ndarray, np.ndarray] | None = None
+        """Usable thrusters (n,) and preload (n,), N, of the last call of `preload`, which computes only what has changed since."""
         self._limits = ThrustLimits(body.thrusters.f_min, body.thrusters.f_max, np.full(len(body.modules), np.inf))
         self._set(np.ones(n, dtype=bool), body.thrusters.pinv)
 
@@ -106,20 +106,20 @@ class Allocator:
         self._preloaded = (alive.copy(), self._preload)
         self._rows = np.vstack([self._matrix.T, np.zeros((3, 6))])
         self._goal = np.r_[self._preload, np.ones(3)]
-        self._cheaper = LeastPower(t, alive) if self._least_power else None
+        self._least_power = LeastPower(t, alive) if self.parameters.mode == "least_power" else None
         self._set_limits()
 
     def _set_limits(self) -> None:
         self._f_min, self._f_max = self._limits.low_n * self._alive, self._limits.high_n * self._alive
         self._low, self._high = np.concatenate((self._f_min, np.zeros(3))), np.concatenate((self._f_max, np.ones(3)))
-        if self._cheaper:
-            self._cheaper.confine(self._f_min, self._f_max)
+        if self._least_power:
+            self._least_power.confine(self._f_min, self._f_max)
 
     def step(self, wrench: np.ndarray) -> Thrust:
         """Returns the thruster forces for a wanted (6,) wrench, body frame."""
         thrust = self._within(wrench)
-        if self._cheaper and thrust.scale == (1.0, 1.0):
-            thrust = self._thrust(self._cheaper.step(thrust.force_n), thrust.scale)
+        if self._least_power and thrust.scale == (1.0, 1.0):
+            thrust = self._thrust(self._least_power.step(thrust.force_n), thrust.scale)
         return thrust if self._clip_only or self._is_fed(thrust) else self._fed(wrench, thrust)
 
     def _fed(self, wrench: np.ndarray, unfed: Thrust) -> Thrust:
@@ -173,17 +173,20 @@ class Allocator:
         return Thrust(force, self._matrix.dot(force), kept, 1.0 - busiest(force, self._limits.low_n, self._limits.high_n))
 
     def _saturated(self, wrench: np.ndarray) -> Thrust:
-        """min |f - f_preload|^2 + sum_i w_i (1 - s_i)^2 subject to J f = sum_i s_i W_i, f within limits, 0 <= s_i <= 1; W: `_parts`."""
+        """Solves min |f - f_preload|^2 + sum_i w_i (1 - s_i)^2 subject to J f = sum_i s_i W_i, f within limits, 0 <= s_i <= 1.
+
+        W_i are the `_parts` of the wrench, each scaled down first if it is far too large (`_prescale`).
+        """
         parts = self._parts(wrench)
-        down = np.array([self._down(part) for part in parts])
-        self._rows[-3:] = -parts * down[:, None]
+        prescale = np.array([self._prescale(part) for part in parts])
+        self._rows[-3:] = -parts * prescale[:, None]
         x = np.empty_like(self._goal)
         if not nearest(self._rows, self._weights, self._goal, self._low, self._high, x) <= MAX_RESIDUAL:
             share = self._common_share(wrench)
             return self._thrust(self._pinv @ wrench * share, (share, share))
-        return self._thrust(x[:-3].copy(), _kept((x[-3:] * down) @ parts, wrench))
+        return self._thrust(x[:-3].copy(), _kept((x[-3:] * prescale) @ parts, wrench))
 
-    def _down(self, wrench: np.ndarray) -> float:
+    def _prescale(self, wrench: np.ndarray) -> float:
         """Factor, at most 1, that scales down a wrench above BEYOND times what the thrusters could give."""
         return float(np.min(BEYOND * self._most / np.maximum(_sizes(wrench), TINY), initial=1.0))
 
