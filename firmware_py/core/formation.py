@@ -58,9 +58,9 @@ class Formation:
         if not (inputs.prepared or self.docking.has_work):
             outputs.joints = self.docking.joints
             return
-        bodies = {c.body.index: (c.body, estimates[c.body.index]) for c in self.pipelines}
+        bodies = {each.body.index: (each.body, estimates[each.body.index]) for each in self.pipelines}
         waiting, holding = (self._armed_in(mode) if inputs.prepared else [] for mode in (Mode.DOCK, Mode.POSHOLD))
-        coming = [c.body.index for c in self.pipelines if c.guidance.is_coming] if self.docking.under_way else []
+        coming = [each.body.index for each in self.pipelines if each.guidance.is_coming] if self.docking.under_way else []
         decisions = self.docking.step(inputs, bodies, waiting, holding, coming, self._resting())
         self._miss_partners(outputs, [parted.whole for parted in decisions.parts])
         outputs.docks += self.docking.records
@@ -131,6 +131,7 @@ class Formation:
         ]
 
     def _steer(self, decisions: Decisions) -> None:
+        """Tells the guidance of each body what the docking stage wants of it."""
         for pipeline in self.pipelines:
             number = pipeline.body.index
             if number in decisions.returning:
@@ -143,7 +144,7 @@ class Formation:
                 pipeline.dock_over = True
 
     def _join(self, joined: Join, time_ns: int, estimates: dict[int, Estimate]) -> None:
-        before = self._chains_of(joined.target, joined.active)
+        before = self._pipelines_of(joined.target, joined.active)
         estimate = self._begin(joined.pipeline, before, time_ns)
         if any(pipeline.supervisor.armed for pipeline in before) and not joined.pipeline.supervisor.armed:
             self.docking.events.append(Event(WARNING, "docked to a body that is not armed: all of it is disarmed"))
@@ -151,7 +152,7 @@ class Formation:
 
     def _part(self, parted: Part, time_ns: int, estimates: dict[int, Estimate]) -> None:
         after = [parted.stays, parted.leaves]
-        before = self._chains_of(parted.whole)
+        before = self._pipelines_of(parted.whole)
         self._broken = self._broken_lately(time_ns) + [(time_ns, whole.body) for whole in before if whole.parting]
         found = [self._begin(pipeline, before, time_ns) for pipeline in after]
         parted.leaves.guidance.move_by(parted.away_w)
@@ -163,13 +164,14 @@ class Formation:
             pipeline.retune(self.parameters)
         return take_over(pipeline, before, time_ns)
 
-    def _chains_of(self, *bodies: int) -> list[BodyPipeline]:
+    def _pipelines_of(self, *bodies: int) -> list[BodyPipeline]:
         """Pipelines of the bodies with these numbers, in this order. No body joins or parts twice in a tick."""
         return [pipeline for number in bodies for pipeline in self.pipelines if pipeline.body.index == number]
 
     def _swap(
         self, before: Sequence[BodyPipeline], after: Sequence[BodyPipeline], estimates: dict[int, Estimate], found: Sequence[Estimate]
     ) -> None:
+        """Replaces the bodies `before` by those `after`, whose estimates are `found`; docks with a body that is gone end."""
         for pipeline in before:
             del estimates[pipeline.body.index]
         for pipeline, estimate in zip(after, found, strict=True):
