@@ -48,9 +48,9 @@ class Measurements:
         self._mean_of_all = self._rotations.reshape(3, -1) / len(body.modules)
         self._r_bi, self._mean_r_bi = body.r_bi, body.r_bi.mean(axis=0)
         self._centred = bool(np.abs(self._mean_r_bi).max() < CENTRED_M)
-        self._share = 1.0 - math.exp(-period_ns * 1e-9 / ALPHA_S)
         per_s = 1e9 / period_ns
-        self._gain = self._share * per_s
+        self._alpha_share = 1.0 - math.exp(-period_ns * 1e-9 / ALPHA_S)
+        self._alpha_gain = self._alpha_share * per_s
         count = len(body.modules)
         self._deviation_matrix = np.kron(np.ones((count, 1)), -self._mean_of_all)
         """(3 count, 3 count) matrix from the readings of all modules to the difference of each from their mean, body frame."""
@@ -66,8 +66,10 @@ class Measurements:
         self._accel_from_rate_change = per_s * -np.vstack([skew(r) for r in self._r_bi - self._mean_r_bi])
         """(3 count, 3) matrix from the rate change within a tick to the resulting difference of each accelerometer from their mean."""
         self._is_still = False
+        """Whether the body, of several modules, turned so slowly in the last tick that differences of its sensors tell their offsets."""
         self._last_gyro: np.ndarray | None = None
         self._alpha = np.zeros(3)
+        """(3,) smoothed angular acceleration, body frame, rad/s^2. Kept up only where the IMUs heard may be off the centre of mass."""
         self._tags = {(int(m), int(i)): k for k, (m, i) in enumerate(zip(body.tag_module, body.tag_ids, strict=True))}
         self._levers = np.ascontiguousarray(body.r_bt)
         self._q_tb = np.array([conjugate(np.ascontiguousarray(q)) for q in body.q_bt]).reshape(-1, 4)
@@ -108,7 +110,7 @@ class Measurements:
         swing, heard = self._swing(gyro), [value is not None for value in readings]
         accel = self._mean(readings, self._accel_offsets, swing)
         if not self._centred or len(heard) > 1:
-            self._follow(gyro)
+            self._update_alpha(gyro)
         if accel is None or gyro is None or (self._centred and all(heard)):
             return accel
         lever = self._lever(heard)
@@ -125,12 +127,12 @@ class Measurements:
             return None
         return np.asarray(self._accel_from_rate_change @ (gyro - self._last_gyro))
 
-    def _follow(self, gyro: np.ndarray | None) -> None:
+    def _update_alpha(self, gyro: np.ndarray | None) -> None:
         """Updates the angular acceleration, rad/s^2: the smoothed change of the gyro from tick to tick; zero after a tick without gyro."""
         if gyro is None or self._last_gyro is None:
             self._alpha = np.zeros(3)
         else:
-            self._alpha = self._alpha + self._gain * (gyro - self._last_gyro) - self._share * self._alpha
+            self._alpha = self._alpha + self._alpha_gain * (gyro - self._last_gyro) - self._alpha_share * self._alpha
         self._last_gyro = gyro
 
     def _lever(self, heard: list[bool]) -> np.ndarray:
@@ -138,6 +140,7 @@ class Measurements:
         return self._mean_r_bi if all(heard) else np.asarray(self._r_bi[heard].mean(axis=0))
 
     def _depth(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> float | None:
+        """Returns the depth of the centre of mass by the mean pressure, m; None where no sensor was heard."""
         heard = [m.pressure_pa for m in mine if m.pressure_pa is not None]
         if not heard:
             return None
