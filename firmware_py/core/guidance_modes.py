@@ -76,17 +76,26 @@ class Guidance:
         self.retune(parameters)
         self._trajectory: Trajectory | None = None
         self._start_ns: int | None = None
+        """AUTO's trajectory, and when it began; None while the body is on its way to its start."""
         self._goal: Wish | None = None
+        """Pose that POSHOLD flies to, or to which ALT_HOLD turns; None: sticks alone move the set-point."""
         self._met: tuple[Wish, Wish | None] | None = None
         """Position held before the body moved to meet another, and the one that it was sent to."""
-        self._upright = self._was_unplaced = self._was_rate_commanded = False
+        self._is_unlocated = False
+        """Whether the estimate is levelled by gravity alone, with heading and position unknown."""
+        self._was_unplaced = self._was_rate_commanded = False
         self._point: tuple[int, Setpoint] | None = None
+        """When GUIDED's newest set-point came, and it."""
         self._docking: Setpoint | Wish | None = None
+        """What the docking sequence wants in this tick."""
         self._sticks, self._sticks_ns = Sticks(), 0
         self._time_ns: int | None = None
-        self._offset, self._offset_ns = np.zeros(6), 0
         self._wrench = np.zeros(6)
+        """Wrench of the last tick, (6,), body frame."""
         self._blend = False
+        """Whether the mode has changed since, so that a new blend begins at `_wrench`."""
+        self._offset, self._offset_ns = np.zeros(6), 0
+        """Wrench of the mode before less that of the new one, (6,), when the mode changed, and that time: it fades out from then on."""
         self.mode = Mode.POSHOLD
 
     def retune(self, parameters: Parameters) -> None:
@@ -106,8 +115,8 @@ class Guidance:
 
         That is when the estimate starts from gravity alone, and when tags then give position and heading.
         """
-        before, self._upright = self._upright, health.ready and not health.placed
-        if self._upright != before:
+        before, self._is_unlocated = self._is_unlocated, health.ready and not health.placed
+        if self._is_unlocated != before:
             self._glider.put(at_estimate(estimate))
             self._goal = self._point = None
 
@@ -185,6 +194,7 @@ class Guidance:
         return self._goal or Wish(ZERO, ZERO, at.p_wb, at.q_wb)
 
     def _enter(self, mode: Mode, time_ns: int, estimate: Estimate) -> None:
+        """Changes the mode: drops what the last one flew to, and a streamed set-point that is too old."""
         if CONTROLLED[self.mode] != CONTROLLED[Mode.POSHOLD]:
             self._glider.put(at_estimate(estimate))
         self._go_on(estimate)
@@ -320,13 +330,14 @@ class Guidance:
         return np.where(np.abs(self._inside(soon) - soon) > np.abs(self._inside(p_wb) - p_wb), 0.0, v_w)
 
     def _placed(self, health: Health) -> bool:
+        """Whether tags tell the position, or did lately."""
         return health.ready and health.tag_age_s <= self._no_place_s
 
     # ------------------------------------------------------------ the wrench
 
     def mix(self, wrench: np.ndarray, time_ns: int, estimate: Estimate, health: Health) -> np.ndarray:
         """Returns the wrench of the mode from that of the controller, (6,), body frame; blends over from the last mode within `blend_s`."""
-        out = self._kept(wrench, time_ns, estimate, health)
+        out = self._by_mode(wrench, time_ns, estimate, health)
         if self._blend:
             self._offset, self._offset_ns, self._blend = self._wrench - out, time_ns, False
         left = 1.0 - (time_ns - self._offset_ns) * 1e-9 / max(self._p.blend_s, 1e-9)
@@ -335,7 +346,8 @@ class Guidance:
         self._wrench = out
         return np.asarray(out)
 
-    def _kept(self, wrench: np.ndarray, time_ns: int, estimate: Estimate, health: Health) -> np.ndarray:
+    def _by_mode(self, wrench: np.ndarray, time_ns: int, estimate: Estimate, health: Health) -> np.ndarray:
+        """Returns the wrench (6,) of the mode: what the controller commands in it (CONTROLLED), and the sticks for the rest."""
         if self.mode == Mode.SURFACE:
             return self._surfacing(wrench, estimate, health)
         force, moment = CONTROLLED[self.mode]
