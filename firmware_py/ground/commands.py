@@ -14,7 +14,7 @@ from firmware_py.ground.dialect import Message
 from firmware_py.ground.identity import CUSTOM_MODE_ENABLED, SETTABLE
 from firmware_py.ground.message_requests import MessageRequests
 from firmware_py.ground.mission_flight import MissionFlight
-from firmware_py.ground.mission_items import ABSOLUTE, ONE_WAY_SPEEDS, RELATIVE
+from firmware_py.ground.mission_items import ABSOLUTE, CHANGE_SPEED, ONE_WAY_SPEEDS, RELATIVE
 from firmware_py.ground.steering import Steering
 from firmware_py.ground.system import Arrival, Handler, System
 
@@ -23,11 +23,13 @@ DECISION_NS = 400_000_000
 _FORCED = (21196, 2989)
 """Second parameter of a forced arm or disarm: MAVLink's, and ArduPilot's for arming."""
 
-SET_MODE, TERMINATE, REPOSITION, ARM = 176, 185, 192, 400
+LOITER_UNLIM, RETURN_TO_LAUNCH, LAND = 17, 20, 21
+SET_MODE, TERMINATE, REPOSITION, PAUSE_CONTINUE, MOTOR_TEST, SET_MISSION_CURRENT = 176, 185, 192, 193, 209, 224
+REBOOT, MISSION_START, ARM = 246, 300, 400
+"""MAV_CMD, without their prefixes NAV, DO and PREFLIGHT; ARM is COMPONENT_ARM_DISARM."""
 DOCK, UNDOCK, ESTOP, CLEAR_ESTOP = 31010, 31011, 31012, 31013
 """User commands: docs/ground-station.md. Dock: module, face, target module, target face, quarter turns, both move."""
-SET_CURRENT, MOTOR_TEST = 224, 209
-_NEEDED = {ARM: 1, TERMINATE: 1, SET_CURRENT: 1, MOTOR_TEST: 3, DOCK: 4, UNDOCK: 4}
+_NEEDED = {ARM: 1, TERMINATE: 1, SET_MISSION_CURRENT: 1, MOTOR_TEST: 3, DOCK: 4, UNDOCK: 4}
 """Number of leading parameters that a command must give: one that is not finite would count as 0, which disarms or clears an e-stop."""
 
 _LEFT_OUT = 2**31 - 1
@@ -54,18 +56,18 @@ class CommandService:
         self._pending: list[Pending] = []
         self.reboot_asked = False
         self._table: dict[int, Callable[[Command], Answer]] = {
-            17: lambda c: self._enter(c, Mode.POSHOLD),  # NAV_LOITER_UNLIM
-            20: self._surface,  # NAV_RETURN_TO_LAUNCH
-            21: self._surface,  # NAV_LAND
+            LOITER_UNLIM: lambda c: self._enter(c, Mode.POSHOLD),
+            RETURN_TO_LAUNCH: self._surface,
+            LAND: self._surface,
             SET_MODE: self._set_mode,
-            178: self._change_speed,
+            CHANGE_SPEED: self._change_speed,
             TERMINATE: self._terminate,
             REPOSITION: self._reposition,
-            193: self._pause,
+            PAUSE_CONTINUE: self._pause,
             MOTOR_TEST: self._motor_test,
-            SET_CURRENT: self._set_current,
-            246: self._reboot,
-            300: lambda c: self._start_mission(c, max(0, int(c.get(1)))),
+            SET_MISSION_CURRENT: self._set_current,
+            REBOOT: self._reboot,
+            MISSION_START: lambda c: self._start_mission(c, max(0, int(c.get(1)))),
             ARM: self._arm,
             DOCK: lambda c: self._dock(c, Action.DOCK),
             UNDOCK: lambda c: self._dock(c, Action.UNDOCK),

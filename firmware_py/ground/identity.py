@@ -12,19 +12,20 @@ AUTOPILOT_GENERIC, AUTOPILOT_ARDUPILOT = 0, 3
 TYPE_SUBMARINE = 12
 COMPONENT_AUTOPILOT = 1
 """Clients find no autopilot under another component id."""
-CUSTOM_MODE_ENABLED, ARMED = 1, 128
+CUSTOM_MODE_ENABLED, _AUTO, _GUIDED, _STABILIZE, _MANUAL_INPUT, ARMED = 1, 4, 8, 16, 64, 128
+"""MAV_MODE_FLAG."""
 _FLAGS: Mapping[Mode, int] = {
-    Mode.MANUAL: 64,
-    Mode.STABILIZE: 64 | 16,
-    Mode.ALT_HOLD: 64 | 16,
-    Mode.POSHOLD: 64 | 16 | 8,
-    Mode.GUIDED: 16 | 8,
-    Mode.AUTO: 16 | 8 | 4,
-    Mode.SURFACE: 16 | 8 | 4,
-    Mode.DOCK: 16 | 8 | 4,
-    Mode.MOTOR_DETECT: 64,
+    Mode.MANUAL: _MANUAL_INPUT,
+    Mode.STABILIZE: _MANUAL_INPUT | _STABILIZE,
+    Mode.ALT_HOLD: _MANUAL_INPUT | _STABILIZE,
+    Mode.POSHOLD: _MANUAL_INPUT | _STABILIZE | _GUIDED,
+    Mode.GUIDED: _STABILIZE | _GUIDED,
+    Mode.AUTO: _STABILIZE | _GUIDED | _AUTO,
+    Mode.SURFACE: _STABILIZE | _GUIDED | _AUTO,
+    Mode.DOCK: _STABILIZE | _GUIDED | _AUTO,
+    Mode.MOTOR_DETECT: _MANUAL_INPUT,
 }
-"""MAV_MODE_FLAG: manual input 64, stabilize 16, guided 8, auto 4."""
+"""Flags of each mode in HEARTBEAT."""
 
 
 @dataclass(frozen=True, slots=True)

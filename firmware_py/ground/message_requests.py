@@ -10,6 +10,8 @@ from firmware_py.ground.command import ACCEPTED, DENIED, UNSUPPORTED, Answer, Co
 from firmware_py.ground.system import NS_PER_S, Arrival, Handler, System
 from firmware_py.ground.telemetry import DEFAULT_HZ, STREAMS
 
+GET_HOME_POSITION, GET_MESSAGE_INTERVAL, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE, REQUEST_CAPABILITIES = 410, 510, 511, 512, 520
+"""MAV_CMD; the last is REQUEST_AUTOPILOT_CAPABILITIES."""
 _STOP, _START = 0, 1
 _GROUPS: Mapping[int, tuple[str, ...]] = {
     1: ("SCALED_PRESSURE", "SCALED_PRESSURE2"),  # RAW_SENSORS
@@ -35,11 +37,11 @@ class MessageRequests:
     def table(self) -> dict[int, Callable[[Command], Answer]]:
         """Command handlers by command number."""
         return {
-            410: lambda c: self._request(c, "HOME_POSITION"),
-            510: self._get_interval,
-            511: self._set_interval,
-            512: self._request_message,
-            520: lambda c: self._request(c, "AUTOPILOT_VERSION"),
+            GET_HOME_POSITION: lambda c: self._request(c, "HOME_POSITION"),
+            GET_MESSAGE_INTERVAL: self._get_interval,
+            SET_MESSAGE_INTERVAL: self._set_interval,
+            REQUEST_MESSAGE: self._request_message,
+            REQUEST_CAPABILITIES: lambda c: self._request(c, "AUTOPILOT_VERSION"),
         }
 
     def handlers(self) -> dict[str, Handler]:

@@ -30,6 +30,10 @@ _POSITION_BIT, _VELOCITY_BIT, _ACCELERATION_BIT, _NO_YAW, _NO_YAW_RATE = 0, 3, 6
 """POSITION_TARGET_TYPEMASK: number of the first of three bits, one per axis, that mark an axis as left out; masks of the last two bits."""
 _FORCES, _NO_ACCELERATION = 0x200, 7 << _ACCELERATION_BIT
 """Mask of the bit by which the acceleration fields are forces, N; mask by which all three of them are left out."""
+_NO_ATTITUDE = 0x80
+"""ATTITUDE_TARGET_TYPEMASK: the attitude is left out."""
+_HAS_PITCH, _HAS_ROLL = 1, 2
+"""Bits of `enabled_extensions` in MANUAL_CONTROL: the axes s and t are sent."""
 _RC_IGNORED = 0xFFFF
 """Value of a channel of RC_CHANNELS_OVERRIDE that stays as it is; 0 releases the channel."""
 BUTTONS: tuple[str, ...] = (
@@ -149,8 +153,8 @@ class Steering:
         extensions = m["enabled_extensions"]
         force = (_axis(m["x"]), _axis(m["y"]), -self._up(m["z"]))
         moment = (
-            _axis(m["t"]) if extensions & 2 else 0.0,
-            _axis(m["s"]) if extensions & 1 else 0.0,
+            _axis(m["t"]) if extensions & _HAS_ROLL else 0.0,
+            _axis(m["s"]) if extensions & _HAS_PITCH else 0.0,
             _axis(m["r"]),
         )
         fresh = self._pilots.freshly_pressed(arrival, m["buttons"] | m["buttons2"] << 16)
@@ -269,7 +273,7 @@ class Steering:
         """Takes an attitude, and keeps the position set-point: the robot is omnidirectional."""
         m = arrival.message
         q = np.array(m["q"], dtype=float)
-        if m["type_mask"] & 0x80 or not np.all(np.isfinite(q)) or not 0.5 < float(np.linalg.norm(q)) < 2.0:
+        if m["type_mask"] & _NO_ATTITUDE or not np.all(np.isfinite(q)) or not 0.5 < float(np.linalg.norm(q)) < 2.0:
             return
         if not self._system.body_is_known:
             return
