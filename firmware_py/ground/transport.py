@@ -133,7 +133,8 @@ class TcpLink:
     def __init__(self, address: tuple[str, int]) -> None:
         self._server = socket.create_server(address)
         self._server.setblocking(False)
-        self._left: dict[socket.socket, bytes] = {}
+        self._unsent: dict[socket.socket, bytes] = {}
+        """Rest of the frame that each connected client has accepted in part only."""
 
     @property
     def port(self) -> int:
@@ -145,8 +146,8 @@ class TcpLink:
             peer, _ = self._server.accept()
             peer.setblocking(False)
             peer.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            self._left[peer] = b""
-        got = [(peer, data) for peer in list(self._left) if (data := self._read(peer)) is not None]
+            self._unsent[peer] = b""
+        got = [(peer, data) for peer in list(self._unsent) if (data := self._read(peer)) is not None]
         for peer, data in got:
             if not data:
                 self.leave(peer)
@@ -162,14 +163,14 @@ class TcpLink:
 
     def send(self, peer: Any, frame: bytes) -> bool:
         """Sends a frame, after the rest of the previous one if that was sent in part."""
-        if peer not in self._left:
+        if peer not in self._unsent:
             return True
         try:
-            if self._left[peer]:
-                self._left[peer] = self._left[peer][peer.send(self._left[peer]) :]
-            if self._left[peer]:
+            if self._unsent[peer]:
+                self._unsent[peer] = self._unsent[peer][peer.send(self._unsent[peer]) :]
+            if self._unsent[peer]:
                 return False
-            self._left[peer] = frame[peer.send(frame) :]
+            self._unsent[peer] = frame[peer.send(frame) :]
         except BlockingIOError:
             return False
         except OSError:
@@ -177,14 +178,14 @@ class TcpLink:
         return True
 
     def leave(self, peer: socket.socket) -> None:
-        self._left.pop(peer, None)
+        self._unsent.pop(peer, None)
         peer.close()
 
     def peers(self) -> Sequence[Any]:
-        return list(self._left)
+        return list(self._unsent)
 
     def close(self) -> None:
-        for peer in list(self._left):
+        for peer in list(self._unsent):
             self.leave(peer)
         self._server.close()
 
@@ -247,7 +248,8 @@ class SerialLink:
     def __init__(self, device: str, baud: int) -> None:
         self._device, self._baud = device, baud
         self._serial: Any = None
-        self._left = b""
+        self._unsent = b""
+        """Rest of the frame that the device has accepted in part only."""
 
     def open(self) -> None:
         """Opens the device. Raises OSError."""
@@ -271,7 +273,7 @@ class SerialLink:
 
     def _pulled(self) -> None:
         self._serial.close()
-        self._serial, self._left = None, b""
+        self._serial, self._unsent = None, b""
 
     def receive(self) -> list[tuple[Any, bytes]]:
         if not self._is_plugged():
@@ -288,10 +290,10 @@ class SerialLink:
         if self._serial is None:
             return True
         try:
-            self._left = self._left[self._write(self._left) :] if self._left else b""
-            if self._left:
+            self._unsent = self._unsent[self._write(self._unsent) :] if self._unsent else b""
+            if self._unsent:
                 return False
-            self._left = frame[self._write(frame) :]
+            self._unsent = frame[self._write(frame) :]
         except BlockingIOError:
             return False
         except OSError:
