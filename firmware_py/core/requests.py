@@ -33,7 +33,7 @@ def _is_forced(argument: Any) -> bool:
 
 
 def _is_mode(argument: Any) -> bool:
-    return isinstance(argument, Mode) and MODES[argument].request
+    return isinstance(argument, Mode) and MODES[argument].on_request
 
 
 def _is_real(value: Any) -> bool:

@@ -60,6 +60,7 @@ class Supervisor:
         self._was_idle = True
         """Whether the body was disarmed in the previous tick, with no module stopped and no recent e-stop that could still hold one."""
         self._testing = False
+        """Whether a motor test armed the body, without the arming checks for flight."""
 
     @property
     def armed(self) -> bool:
@@ -159,16 +160,17 @@ class Supervisor:
         if reasons:
             self._say(WARNING, f"{trigger.name} refused: {'; '.join(dict.fromkeys(reasons))}")
             return None
-        self._go(row, mode)
+        self._make(row, mode)
         return Decision(trigger, row.effect, mode, argument)
 
     def _mode_after(self, row: Transition) -> Mode:
         """The present mode; POSHOLD if the body stops in a mode that no person chose or may choose: it would next be armed in it."""
         comes_to_rest = self.armed and row.next_state not in ARMED
-        chosen = self.level == Level.NONE and not self._testing and MODES[self.mode].request
+        chosen = self.level == Level.NONE and not self._testing and MODES[self.mode].on_request
         return Mode.POSHOLD if comes_to_rest and not chosen else self.mode
 
-    def _go(self, row: Transition, mode: Mode) -> None:
+    def _make(self, row: Transition, mode: Mode) -> None:
+        """Makes a transition that was granted, and reports it."""
         if (row.next_state, mode) != (self.state, self.mode):
             self._say(INFORMATION, f"{self.state.name} {self.mode.name} -> {row.next_state.name} {mode.name}")
         if row.next_state != self.state or row.effect in TAKES_OVER:
@@ -186,11 +188,11 @@ class Supervisor:
             return against_arming(question, guard == Guard.FORCED_CHECKS)
         if guard == Guard.MODE_NEEDS:
             return missing(mode, health, self._p)
-        holds = guard in (Guard.PARTING_PERMITTED, Guard.JOINT_OPEN) and modules_of(argument) not in health.open_joints
+        joint_holds = guard in (Guard.PARTING_PERMITTED, Guard.JOINT_OPEN) and modules_of(argument) not in health.open_joints
         if guard == Guard.JOINT_OPEN:
-            return ["the body is disarmed, and the joint is not open"] if holds else []
+            return ["the body is disarmed, and the joint is not open"] if joint_holds else []
         if guard in IGNORED_FAILSAFES:
-            ignored = IGNORED_FAILSAFES[Guard.MODE_PERMITTED if holds else guard]
+            ignored = IGNORED_FAILSAFES[Guard.MODE_PERMITTED if joint_holds else guard]
             reasons = missing(mode, health, self._p) or self._failsafes.reasons_against(mode, health, ignored)
             if self._testing:  # a test armed the body, so the arming checks for flight have not run yet
                 reasons = reasons or self._reasons(Guard.ARMING_CHECKS, mode, health)

@@ -179,22 +179,22 @@ class ModeRow(NamedTuple):
 
     mode: Mode
     needs: frozenset[Need]
-    by_pilot: bool
-    """Sticks steer it: the pilot may always take it, whatever fail-safe is on."""
-    request: bool
-    """SET_MODE may ask for it."""
+    by_pilot: bool = False
+    """Whether sticks steer it: the pilot may always take it, whatever fail-safe is on."""
+    on_request: bool = True
+    """Whether SET_MODE may ask for it."""
 
 
 MODE_TABLE = (
-    ModeRow(Mode.MANUAL, frozenset({Need.PILOT}), True, True),
-    ModeRow(Mode.STABILIZE, frozenset({Need.ATTITUDE, Need.PILOT}), True, True),
-    ModeRow(Mode.ALT_HOLD, frozenset({Need.ATTITUDE, Need.DEPTH}), True, True),
-    ModeRow(Mode.POSHOLD, frozenset({Need.ATTITUDE, Need.POSITION}), False, True),
-    ModeRow(Mode.AUTO, frozenset({Need.ATTITUDE, Need.POSITION}), False, True),
-    ModeRow(Mode.GUIDED, frozenset({Need.ATTITUDE, Need.POSITION}), False, True),
-    ModeRow(Mode.SURFACE, frozenset(), False, True),
-    ModeRow(Mode.MOTOR_DETECT, frozenset(), False, True),
-    ModeRow(Mode.DOCK, frozenset({Need.ATTITUDE, Need.POSITION}), False, False),
+    ModeRow(Mode.MANUAL, frozenset({Need.PILOT}), by_pilot=True),
+    ModeRow(Mode.STABILIZE, frozenset({Need.ATTITUDE, Need.PILOT}), by_pilot=True),
+    ModeRow(Mode.ALT_HOLD, frozenset({Need.ATTITUDE, Need.DEPTH}), by_pilot=True),
+    ModeRow(Mode.POSHOLD, frozenset({Need.ATTITUDE, Need.POSITION})),
+    ModeRow(Mode.AUTO, frozenset({Need.ATTITUDE, Need.POSITION})),
+    ModeRow(Mode.GUIDED, frozenset({Need.ATTITUDE, Need.POSITION})),
+    ModeRow(Mode.SURFACE, frozenset()),
+    ModeRow(Mode.MOTOR_DETECT, frozenset()),
+    ModeRow(Mode.DOCK, frozenset({Need.ATTITUDE, Need.POSITION}), on_request=False),
 )
 
 MODES = {row.mode: row for row in MODE_TABLE}

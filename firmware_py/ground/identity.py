@@ -116,7 +116,7 @@ ARDUSUB = Identity(
 IDENTITIES = {identity.name: identity for identity in (GENERIC, ARDUSUB)}
 """Identities by the name that the command line takes."""
 
-SETTABLE = tuple(row.mode for row in MODE_TABLE if row.request)
+SETTABLE = tuple(row.mode for row in MODE_TABLE if row.on_request)
 """Modes that a person may select; DOCK is entered by a docking request instead."""
 
 NAMES: Mapping[Mode, str] = {

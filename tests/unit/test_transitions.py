@@ -100,7 +100,7 @@ def test_armed_robot_changes_its_mode_by_these_rows() -> None:
 def test_modes_need_and_allow_what_the_table_says() -> None:
     assert [r.mode for r in MODE_TABLE] == list(MODES) and set(MODES) == set(Mode)
     assert {mode for mode, r in MODES.items() if r.by_pilot} == {Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD}
-    assert {mode for mode, r in MODES.items() if not r.request} == {Mode.DOCK}
+    assert {mode for mode, r in MODES.items() if not r.on_request} == {Mode.DOCK}
     for mode in (Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.DOCK):
         assert MODES[mode].needs == {Need.ATTITUDE, Need.POSITION}
     assert MODES[Mode.MANUAL].needs == {Need.PILOT}
