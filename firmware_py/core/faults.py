@@ -97,11 +97,12 @@ class FaultDetector:
         self._t = t
         self._passive = list(body.passive)
         self._thruster_at = by_channel(body)
-        self._pairs = [{c: (at.get(c, -1), at.get(c + 1, -1)) for c in range(max(at) + 1)} for at in self._thruster_at]
+        self._pair_at = [{c: (at.get(c, -1), at.get(c + 1, -1)) for c in range(max(at) + 1)} for at in self._thruster_at]
+        """Per module and first channel of an ESC feedback: the indices of its two thrusters, -1 where there is none."""
         self._modules = body.modules
         self._names = tuple(map(name_of, places_of(body)))
-        full_n = np.array([(polynomial(f, 1.0), polynomial(r, 1.0)) for f, r in zip(t.forward, t.reverse, strict=True)])
-        self._believed = (full_n, t.rpm_at_full)
+        self._full_n = np.array([(polynomial(f, 1.0), polynomial(r, 1.0)) for f, r in zip(t.forward, t.reverse, strict=True)])
+        """(n, 2) forces at full speed forward and in reverse, N."""
         self._motion = MissingThrust(body, parameters, period_ns)
         self.retune(parameters)
         n = t.f_max.size
@@ -110,10 +111,13 @@ class FaultDetector:
         self._silent_after = max(1, SILENT_NS // period_ns)
         self._silence = [0] * len(body.modules)
         """Ticks that each module has been silent; counts down again while an excluded module is heard."""
-        self._mute: list[int] = []
+        self._silent: list[int] = []
+        """Modules, by place in the body, whose thrusters are left out because of their silence."""
         self._rank = self._steered_rank(t.matrix)
         self._counts = np.zeros((n, len(WHY)), dtype=np.int64)
-        self._heard, self._share = np.zeros((n, 2)), np.ones(n)
+        """(n, 3) feedbacks in a row that showed ESC_FAILED, STALLED and WRONG_SPEED."""
+        self._feedback_means, self._reported_share = np.zeros((n, 2)), np.ones(n)
+        """Running means, and the share of the believed force that they show: `means` and `share` of `count_feedback`."""
         self.words: list[str] = []
         """Messages of this tick, for people."""
         self.changed = False
@@ -131,7 +135,7 @@ class FaultDetector:
         for other in before:
             for i, j in in_both(self._modules, other._modules):
                 self._silence[i] = other._silence[j]
-                self._mute += [i] if j in other._mute else []
+                self._silent += [i] if j in other._silent else []
                 for channel, thruster in self._thruster_at[i].items():
                     number = other._thruster_at[j][channel]
                     self._obeys[thruster] = other._obeys[number]
@@ -144,7 +148,7 @@ class FaultDetector:
         self._counts[:] = 0
         self._motion.reset()
         self.changed = not self.now.alive.all()
-        self._obeys[:], self._mute = True, []
+        self._obeys[:], self._silent = True, []
         self.now = self._state_for(self._obeys)
 
     def step(
@@ -167,62 +171,63 @@ class FaultDetector:
             free: no magnet pulls at another body or pushes anything away; while one does, the motion says nothing about thrusters.
         """
         self.words, self.changed = [], False
-        found = self._motion.step(measured, estimate, mean_n * self._share, self.now.alive, armed, free)
+        found = self._motion.step(measured, estimate, mean_n * self._reported_share, self.now.alive, armed, free)
         if found is not None:
             self._lose(found, "does not push as it says")
         elif self._motion.acquitted is not None:
             self._take_back(self._motion.acquitted)
         own = [modules[m] for m in self._modules]
-        (self._hear if armed else self._hear_at_rest)(own, force_n)
-        self._miss(own, armed)
+        (self._judge_feedback if armed else self._judge_at_rest)(own, force_n)
+        self._judge_silence(own, armed)
         return self.now
 
-    def _miss(self, modules: list[ModuleInputs], armed: bool) -> None:
+    def _judge_silence(self, modules: list[ModuleInputs], armed: bool) -> None:
         """Excludes the thrusters of modules that have fallen silent; re-admits them once the module has been heard for as long again."""
-        before = self._mute
+        before = self._silent
         for i, module in enumerate(modules):
             if not module.heard:
                 self._silence[i] = min(self._silence[i] + 1, self._silent_after)
             elif self._silence[i]:
                 self._silence[i] = self._silence[i] - 1 if i in before else 0
         quiet = [i for i, ticks in enumerate(self._silence) if ticks == self._silent_after or (ticks and i in before)]
-        self._mute = quiet if armed else []
-        if self._mute == before:
+        self._silent = quiet if armed else []
+        if self._silent == before:
             return
         alive, self.now = self.now.alive, self._usable_state()
         if not np.array_equal(alive, self.now.alive):
             self.changed = True
             self._motion.forget()
-            silent = ", ".join(str(self._modules[i]) for i in self._mute)
+            silent = ", ".join(str(self._modules[i]) for i in self._silent)
             less = bool((self.now.alive < self._obeys).any())
             self.words.append(f"thrusters of silent module {silent} are left out" if less else "thrusters of every module are used again")
 
     def _usable_state(self) -> ThrusterFaults:
         """Returns the fault state: all thrusters that obey, without those of silent modules where the others have the same rank."""
         obeying = self._state_for(self._obeys)
-        if not self._mute:
+        if not self._silent:
             return obeying
-        heard = self._state_for(self._obeys & ~np.isin(self._t.module, self._mute))
-        return heard._replace(dead=obeying.dead) if heard.lost_axes == obeying.lost_axes else obeying
+        without = self._state_for(self._obeys & ~np.isin(self._t.module, self._silent))
+        return without._replace(dead=obeying.dead) if without.lost_axes == obeying.lost_axes else obeying
 
-    def _hear(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
+    def _judge_feedback(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
         """Compares every ESC's feedback with the believed force of its thruster."""
-        heard: list[float] = []
-        for module, pairs in zip(modules, self._pairs, strict=True):
+        numbers: list[float] = []
+        for module, pair_at in zip(modules, self._pair_at, strict=True):
             for esc in module.esc:
-                heard += pairs.get(esc.first, NEITHER)
-                heard += esc.rpm
-                heard += esc.status
-        if not heard:
+                numbers += pair_at.get(esc.first, NEITHER)
+                numbers += esc.rpm
+                numbers += esc.status
+        if not numbers:
             return
-        feedback = np.array(heard, dtype=np.float64).reshape(-1, 3, 2)
-        limits = (*self._limits, self._needed)
-        if count_feedback(feedback, force_n, self.now.alive, *self._believed, *limits, self._counts, self._heard, self._share):
+        feedback = np.array(numbers, dtype=np.float64).reshape(-1, 3, 2)
+        full, limits = (self._full_n, self._t.rpm_at_full), (*self._limits, self._needed)
+        state = (self._counts, self._feedback_means, self._reported_share)
+        if count_feedback(feedback, force_n, self.now.alive, *full, *limits, *state):
             for i, kind in np.argwhere(self._counts >= self._needed).tolist():
                 if self.now.alive[i]:
                     self._lose(i, WHY[kind])
 
-    def _hear_at_rest(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
+    def _judge_at_rest(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
         """Warns of a propeller that turns while disarmed: somebody may be about to reach for it."""
         for module, thruster_at in zip(modules, self._thruster_at, strict=True):
             for esc in module.esc:
@@ -232,15 +237,14 @@ class FaultDetector:
 
     def _watch_at_rest(self, i: int, rpm: float, force_n: np.ndarray) -> None:
         """Judges one feedback while disarmed. The limit follows the believed force, as a propeller runs down after a flight."""
-        most = FAST_SHARE * abs(self.believed_rpm(i, force_n[i])) + FAST_MARGIN * self._believed[1][i]
+        most = FAST_SHARE * abs(self.believed_rpm(i, force_n[i])) + FAST_MARGIN * self._t.rpm_at_full[i]
         self._counts[i, WRONG_SPEED] = self._counts[i, WRONG_SPEED] + 1 if abs(rpm) > most else 0
         if self._counts[i, WRONG_SPEED] == self._needed[WRONG_SPEED]:
             self.words.append(f"{self._names[i]} turns though it was told to stand still")
 
     def believed_rpm(self, i: int, force_n: float) -> float:
         """Returns the speed of thruster `i` at a force, 1/min."""
-        full_n, rpm_at_full = self._believed
-        return float(believed_rpm(force_n, full_n[i], rpm_at_full[i]))
+        return float(believed_rpm(force_n, self._full_n[i], self._t.rpm_at_full[i]))
 
     def _lose(self, i: int, why: str) -> None:
         self._obeys[i] = False
@@ -276,7 +280,7 @@ def believed_rpm(force_n, full_n, rpm_at_full):  # type: ignore[no-untyped-def]
 
 
 @njit(f"boolean(float64[:,:,::1],{V},boolean[::1],{M},{V},{V},float64,int64[::1],int64[:,::1],{M},{V})", cache=True)
-def count_feedback(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, needed, counts, heard, share):  # type: ignore[no-untyped-def]
+def count_feedback(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, needed, counts, means, share):  # type: ignore[no-untyped-def]
     """Updates fault counts and force shares from ESC feedback; returns whether any thruster has shown a fault often enough.
 
     Args:
@@ -285,7 +289,7 @@ def count_feedback(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_
         least_n: (n,) smallest believed force at which a standstill is judged, N; dead_share: the parameter.
         needed: (3,) feedbacks in a row that suffice for ESC_FAILED, STALLED, WRONG_SPEED.
         counts: (n, 3) feedbacks in a row that showed ESC_FAILED, STALLED, WRONG_SPEED; a clear STALLED after another one counts twice.
-        heard: (n, 2) running means of reported times believed force, and of believed force squared, any unit.
+        means: (n, 2) running means of reported times believed force, and of believed force squared, any unit.
         share: (n,) share of the believed force that the speeds report, 0 to 1: a thruster whose ESC reports it as weak is not a liar.
     """
     found = False
@@ -296,10 +300,10 @@ def count_feedback(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_
                 continue
             believed = believed_rpm(force_n[i], full_n[i], rpm_at_full[i])
             count, margin = counts[i], FAST_MARGIN * rpm_at_full[i]
-            asked, given = believed * abs(believed), rpm * abs(rpm)
-            heard[i, 0] += FEEDBACK_WEIGHT * (given * asked - heard[i, 0])
-            heard[i, 1] += FEEDBACK_WEIGHT * (asked * asked - heard[i, 1])
-            share[i] = min(1.0, max(0.0, heard[i, 0] / heard[i, 1])) if heard[i, 1] > 0.0 else 1.0
+            asked, given = believed * abs(believed), rpm * abs(rpm)  # as believed_rpm: force goes with the square of the speed
+            means[i, 0] += FEEDBACK_WEIGHT * (given * asked - means[i, 0])
+            means[i, 1] += FEEDBACK_WEIGHT * (asked * asked - means[i, 1])
+            share[i] = min(1.0, max(0.0, means[i, 0] / means[i, 1])) if means[i, 1] > 0.0 else 1.0
             stands = abs(rpm) < dead_share * abs(believed)
             wrong_way = rpm * believed < 0.0 and not stands and abs(rpm - believed) > margin
             count[ESC_FAILED] = count[ESC_FAILED] + 1 if status in ESC_DOWN else 0

@@ -37,7 +37,7 @@ def test_fault_names_the_module_and_the_thruster_there(pair: Body) -> None:
     detector.words.clear()
     turning = ModuleInputs(esc=[EscFeedback(2, (0.0, 2000.0), (0.5, 0.5), (0, 0))])
     for _ in range(10):
-        detector._hear_at_rest([ModuleInputs(), turning], np.zeros(16))
+        detector._judge_at_rest([ModuleInputs(), turning], np.zeros(16))
     assert detector.words == ["thruster 4 of module 2 turns though it was told to stand still"]
 
 
