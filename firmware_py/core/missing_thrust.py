@@ -89,7 +89,7 @@ class MissingThrust:
         self._period_s = period_ns * 1e-9
         self.acquitted: int | None = None
         """Thruster that was left out because of its motion, and that this tick showed to be innocent."""
-        self._residual, self._whole = np.zeros(6), 0
+        self._mean_residual, self._whole = np.zeros(6), 0
         """Running mean of the wrench residual, and the number of whole blocks in it, at most BASE."""
         self.reset()
         self.forget()
@@ -111,7 +111,9 @@ class MissingThrust:
         """Velocity, attitude, forces and specific force of each tick of the block."""
         self._first = self._last = gyro
         self._first_n = self._last_n = 0
+        """First and last rates of the block, and after how many of its ticks they were measured; 0: at its start."""
         self._free, self._pulled = True, False
+        """So far: no magnet acted, and the estimate was ready, in every tick; a magnet acted in some tick."""
 
     def step(
         self, measured: Measured, estimate: Estimate, force_n: np.ndarray, alive: np.ndarray, armed: bool, free: bool
@@ -147,26 +149,26 @@ class MissingThrust:
     def _close(self, estimate: Estimate) -> bool:
         """Ends the block and stores it; returns whether it is whole, that is, can be judged."""
         n, accels, speed = len(self._seen), 0, 0.0
-        felt, model, coriolis, flow, forces = np.zeros(3), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(self._columns.shape[0])
+        acceleration, model, coriolis, flow, forces = np.zeros(3), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(self._columns.shape[0])
         for nu, q_wb, force_n, accel in self._seen:  # in one batch, while the code is in the processor's cache
             speed += add_tick(nu, q_wb, force_n, *self._plant, model, coriolis, flow, forces)
             if accel is not None:
                 accels += 1
-                add_motion(accel, q_wb, felt)
+                add_motion(accel, q_wb, acceleration)
         span = (self._last_n - self._first_n) * self._period_s
         known = accels >= n // 2 and self._first is not None and span >= 0.5 * n * self._period_s
-        alone = estimate.p_wb[2] > self._body.reach_m  # forces at the surface are not modelled here
-        whole = known and alone and self._free and estimate.tag_age_ns < FRESH_NS
-        rest, acted = np.full(6, np.nan), self._columns.T @ (forces / n)
+        submerged = estimate.p_wb[2] > self._body.reach_m  # forces at the surface are not modelled here
+        whole = known and submerged and self._free and estimate.tag_age_ns < FRESH_NS
+        residual, acted = np.full(6, np.nan), self._columns.T @ (forces / n)
         if whole and self._last is not None and self._first is not None:
-            motion = np.concatenate((felt / accels, (self._last - self._first) / span))
-            rest = self._body.mass @ motion - acted - (model + coriolis) / n
+            motion = np.concatenate((acceleration / accels, (self._last - self._first) / span))
+            residual = self._body.mass @ motion - acted - (model + coriolis) / n
             self._whole = min(self._whole + 1, BASE)
-            self._residual = self._residual + (rest - self._residual) / self._whole
+            self._mean_residual = self._mean_residual + (residual - self._mean_residual) / self._whole
         down_b = rotate_back(estimate.q_wb, DOWN)
         self._blocks[:-1] = self._blocks[1:]
         doubts = [max(estimate.sigma_q.tolist()), speed / n]
-        self._blocks[-1] = np.concatenate([rest, acted, down_b, coriolis / n, flow / n, forces / n, doubts])
+        self._blocks[-1] = np.concatenate([residual, acted, down_b, coriolis / n, flow / n, forces / n, doubts])
         return whole
 
     def _decide(self, alive: np.ndarray) -> int | None:
@@ -213,7 +215,7 @@ class MissingThrust:
         self._trial = carried_over([other._held() for other in before], self._body, self._healthy[0])
 
     def _held(self) -> Held:
-        return Held(self._body, self._trial, self._residual if self._whole >= LEAST_BASE else None)
+        return Held(self._body, self._trial, self._mean_residual if self._whole >= LEAST_BASE else None)
 
     def _explain(self, alive: np.ndarray) -> int:
         """Returns the one thruster that explains the change, or -1."""
