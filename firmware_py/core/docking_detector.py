@@ -9,6 +9,7 @@ All watched pairs are rows of one array, served by one compiled pass per tick.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -67,11 +68,14 @@ class PairBank:
         for figure in ("current_ma", "error_m", "spread_m"):
             self.rows[figure] = np.nan
         self._watched = np.unique(self.rows["module"]).tolist()
+        """Fleet indices of the modules of all pairs."""
         self._heard_ma = np.full((max(self._watched, default=-1) + 1, FACES), np.nan)
+        """Currents received in this tick, by fleet index and face; NaN: none, or of a magnet that rests. `watch` resets them."""
         if before is not None:
             self._go_on(before)
 
     def _go_on(self, before: PairBank) -> None:
+        """Copies the rows of the pairs that `before` watched too."""
         known = {key: i for i, key in enumerate(_keys(before.rows))}
         for here, key in enumerate(_keys(self.rows)):
             if key in known:
@@ -120,6 +124,8 @@ class PairDetector:
         return a, b
 
 
+NOTHING = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 12))
+"""`seen` and `poses` of no sightings."""
 TagTable = dict[tuple[int, int], np.ndarray]
 """(module, tag id) -> (7,) tag centre in the module frame, m, and quaternion from module frame to tag frame."""
 
@@ -136,21 +142,15 @@ class Sightings(NamedTuple):
 
 
 class ModulePoses:
-    """Poses of single modules from the pictures of one tick. Created each tick; computed lazily on first use."""
+    """Poses of single modules from the pictures of one tick. Created each tick, and computed only if somebody asks."""
 
     def __init__(self, modules: Sequence[ModuleInputs], tags: TagTable) -> None:
         self._modules = modules
         self._tags = tags
-        self._sightings: Sightings | None = None
 
-    @property
+    @cached_property
     def sightings(self) -> Sightings:
         """Sightings by all observed tags that are in the table."""
-        if self._sightings is None:
-            self._sightings = self._gather()
-        return self._sightings
-
-    def _gather(self) -> Sightings:
         times: list[int] = []
         parts: list[np.ndarray] = []
         for i, module in enumerate(self._modules):
@@ -167,8 +167,6 @@ class ModulePoses:
         return found
 
 
-NOTHING = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 12))
-
-
 def _keys(rows: np.ndarray) -> list[tuple[int, ...]]:
+    """Returns the fleet indices of the two modules of each row: two modules have at most one pair of faces."""
     return [tuple(pair) for pair in rows["module"].tolist()]

@@ -64,11 +64,12 @@ class Limits(NamedTuple):
 TABLE, FIRST, SEEN = numba.float64[:, ::1], numba.int64[::1], numba.int64[:, ::1]
 ROW = numba.from_dtype(PAIR)
 LIMITS = numba.typeof(Limits(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))  # type: ignore[no-untyped-call]
+"""Types of the compiled functions' arguments: `poses` of docking_detector.Sightings, its `first` and `seen`, one PAIR, and the limits."""
 
 
 @njit(numba.void(ROW, numba.int64, numba.boolean, numba.int64, numba.int64), cache=True)
 def _debounce(row, which, seen, time_ns, after_ns):  # type: ignore[no-untyped-def]
-    """Debounces a condition: `seen` by a fresh measurement, it is taken over once nothing else was seen for `after_ns`."""
+    """Debounces a condition: what a fresh measurement says of it (`seen`) holds once nothing else was seen for `after_ns`."""
     if seen == (row.holds[which] != 0):
         row.candidate_ns[which] = NEVER_NS
         return
