@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 RESULT_FILE = "result.json"
-
-
 UNBOUNDED = 1e9
 """A bound of this size or more means no bound."""
 
@@ -75,13 +73,13 @@ class Result(NamedTuple):
     """Warnings of the firmware, a line each (hil.metrics.warning_lines)."""
     unusual: tuple[str, ...] = ()
     """Options that differ from the scenario or the defaults: vehicle, controller, sensors, rate, real time."""
-    what: Flown = Flown()
+    flown: Flown = Flown()
     no_tag_reason: str = ""
     """Why no tag was seen, in words, if the flight could not be flown for that reason."""
 
     @property
-    def flown(self) -> str:
-        """Human-readable description of the flight: its seed and unusual options."""
+    def seed_and_options(self) -> str:
+        """What distinguishes this flight from others of its scenario, in words: its seed and unusual options."""
         return ", ".join([f"seed {self.seed}", *self.unusual])
 
 
@@ -115,7 +113,7 @@ def write_result(result: Result, folder: Path) -> Path:
     plain = {
         "scenario": result.scenario,
         "seed": result.seed,
-        **result.what._asdict(),
+        **result.flown._asdict(),
         "unusual": list(result.unusual),
         "passed": result.passed,
         "metrics": {name: _number(value) for name, value in result.metrics.items()},

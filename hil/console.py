@@ -110,7 +110,7 @@ def what_matters(correlations: Mapping[str, Mapping[str, float]], pairs: int = 0
 def result_table(result: Result) -> Table:
     """Metrics of a run, with limit and verdict beside those that are checked."""
     checks = {check.name: check for check in result.checks}
-    title = Text(f"{result.scenario}, {result.flown}", style="bold")
+    title = Text(f"{result.scenario}, {result.seed_and_options}", style="bold")
     table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
     table.add_column("metric")
     table.add_column("value", justify="right")

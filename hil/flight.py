@@ -77,7 +77,7 @@ def fly_and_judge(
             result = judge_logs(scenario, seed, out, flown.wall_s, flown.deadline_misses, LATE_SHARE)
         else:
             result = judge_logs(scenario, seed, out, fly_scenario(*flight, before_logs=partial(_clear, out)))
-        result = result._replace(unusual=tuple(unusual), what=flown_of(scenario, parameters))
+        result = result._replace(unusual=tuple(unusual), flown=flown_of(scenario, parameters))
         write_result(result, out)
     return result
 

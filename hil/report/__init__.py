@@ -79,10 +79,10 @@ class Scene:
 def write_report(folder: Path, result: Result, flight: Flight, scene: Scene, plots: Sequence[Path]) -> Path:
     """Write report.html into `folder`; returns its path. `plots` are PNG files, inlined in their order."""
     parts = {
-        "title": html.escape(f"{scene.title}, {result.flown}"),
+        "title": html.escape(f"{scene.title}, {result.seed_and_options}"),
         "heading": html.escape(scene.title),
         "description": html.escape(scene.description),
-        "flight": html.escape(result.flown),
+        "flight": html.escape(result.seed_and_options),
         "verdict": "passed" if result.passed else "failed",
         "verdict_text": "All checks passed" if result.passed else "A check failed",
         "headline": _headline(result, scene),
@@ -90,7 +90,7 @@ def write_report(folder: Path, result: Result, flight: Flight, scene: Scene, plo
         "table": _table(result),
         "told": _told(result),
         "plots": "\n".join(_plot(path) for path in plots),
-        "notes": "\n".join(f"<p>{html.escape(note)}</p>" for note in (f"Flown: {result.what}.", NOT_MEASURED, *scene.notes)),
+        "notes": "\n".join(f"<p>{html.escape(note)}</p>" for note in (f"Flown: {result.flown}.", NOT_MEASURED, *scene.notes)),
         "style": _asset("style.css"),
         "viewer": _asset("viewer.js"),
         "data": json.dumps(animation(flight, scene), separators=(",", ":")).replace("<", "\\u003c"),

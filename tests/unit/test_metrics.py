@@ -164,8 +164,8 @@ def test_run_passes_only_when_every_check_does() -> None:
 def test_result_file_has_the_agreed_shape(tmp_path: Path) -> None:
     metrics = {"position_rmse_m": 0.0026, "nis_mean": math.nan, "ticks": 4001.0}
     result = judge("spiral", 3, metrics, LIMITS, ("1.0 s: leak",))
-    what = Flown("0.1.0", "paper", ("modcube",))
-    path = write_result(result._replace(unusual=("paper", "ideal"), what=what), tmp_path)
+    flown = Flown("0.1.0", "paper", ("modcube",))
+    path = write_result(result._replace(unusual=("paper", "ideal"), flown=flown), tmp_path)
     assert json.loads(path.read_text()) == {
         "scenario": "spiral",
         "seed": 3,

@@ -136,7 +136,7 @@ def test_only_the_papers_vehicle_is_shown_beside_the_paper(flight: Flight) -> No
 
 
 def test_report_names_what_flew(flight: Flight, result: Result, tmp_path: Path) -> None:
-    flown = result._replace(what=flown_of(load_scenario("hover"), CONTROLLERS["least_power"]))
+    flown = result._replace(flown=flown_of(load_scenario("hover"), CONTROLLERS["least_power"]))
     page = write_report(tmp_path, flown, flight, scene(), []).read_text()
     assert f"<p>Flown: modcube {version('modcube')}, controller least_power, vehicle modcube.</p>" in page
 
