@@ -48,8 +48,8 @@ def parameters_of(controller: str) -> Parameters:
     return CONTROLLERS[controller]
 
 
-def world_of(name: str, vehicle: str) -> Scenario:
-    """The scenario `name`, with other vehicles if `vehicle` is not empty. Raises DescriptionError."""
+def scenario_with(name: str, vehicle: str) -> Scenario:
+    """The scenario `name`, on another vehicle if `vehicle` is not empty. Raises DescriptionError."""
     from hil.scenario import load_scenario
     from hil.scenario_rules import mistakes
 
@@ -67,7 +67,7 @@ def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
     from hil.bench import fleet_of
     from hil.script import mistake_of_flight
 
-    scenario = world_of(name, vehicle)
+    scenario = scenario_with(name, vehicle)
     if sensors not in ("real", "ideal"):
         raise DescriptionError(f"sensors {sensors!r} is unknown; there are real, ideal")
     if sensors == "ideal":
@@ -255,7 +255,7 @@ def plant(
         from hil.plant_process import serve_until_signal
 
     check_reaches_others(bus, "the plant alone")
-    serve_until_signal(world_of(scenario, vehicle).for_seed(seed), seed, bus, rate_hz, out)
+    serve_until_signal(scenario_with(scenario, vehicle).for_seed(seed), seed, bus, rate_hz, out)
 
 
 @app.command("list")
