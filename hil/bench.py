@@ -168,5 +168,3 @@ def fly_scenario(
         recorder.close()
         recorder.check()
         return wall_s
-
-

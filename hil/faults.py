@@ -102,7 +102,7 @@ class Faults:
         self._push_direction, self._push_arm = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
         self._breaks: dict[str, Callable[[Fault, Mcu], None]] = {
             **dict.fromkeys(THRUSTER_KINDS, self._break_thrusters),
-            "imu_frozen": lambda fault, mcu: setattr(mcu, "frozen", True),
+            "imu_frozen": lambda fault, mcu: setattr(mcu, "imu_frozen", True),
             "pressure_jump": lambda fault, mcu: mcu.depth.err(fault.value, 0.0, 0),
             "pressure_drift": lambda fault, mcu: mcu.depth.err(0.0, fault.value, round(fault.at_s * NS)),
             "pressure_frozen": lambda fault, mcu: setattr(mcu.depth, "frozen", True),
@@ -188,7 +188,7 @@ class Faults:
         """
         self._world.jet_strength = self._world.spec.jet_strength
         for number, mcu in self._nodes.mcus.items():
-            mcu.frozen = mcu.leaks = mcu.readings_absent = False
+            mcu.imu_frozen = mcu.leaks = mcu.readings_absent = False
             mcu.depth.repair()
             self._world.clear_faults(mcu.module)
             for fault in self._on:

@@ -68,7 +68,7 @@ class Mcu:
         self._dock = Noise(stream(world.seed, "dock", module), 6)
         self._fast = [codec.message(name) for name in ("GYRO", "ACCEL", "MCU_STATUS")]
         self._slow = _schedule(codec, number, tick_ns)
-        self.frozen = self.leaks = self.readings_absent = False
+        self.imu_frozen = self.leaks = self.readings_absent = False
         """Faults: the IMU repeats its last sample; water in the cabin; POWER and ENVIRONMENT are not sent."""
         self._motion: tuple[list[float], list[float]] | None = None
         self._counters = dict.fromkeys(SLOW, 0)
@@ -125,7 +125,7 @@ class Mcu:
         truth = self._world.truth(self.module)
         gyro, accel, status = self._fast
         sample = (self._sensors.gyro(truth).tolist(), self._sensors.accel(truth).tolist())
-        if not self.frozen or self._motion is None:
+        if not self.imu_frozen or self._motion is None:
             self._motion = sample
         frames = [
             gyro.encode(self.number, [*self._motion[0], 0], tick),

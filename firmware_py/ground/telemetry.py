@@ -376,4 +376,3 @@ DEFAULT_HZ: Mapping[str, float] = {
     "EXTENDED_SYS_STATE": 1, "HOME_POSITION": 0.5, "GPS_RAW_INT": 0.5, "MISSION_CURRENT": 1, "CURRENT_MODE": 0.5, "SYSTEM_TIME": 0.5,
 }  # fmt: skip
 """Rates until a client requests others."""
-

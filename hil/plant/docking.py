@@ -131,7 +131,7 @@ class Docks:
 
     def magnet_power_w(self) -> np.ndarray:
         """(m,) power that the coils of each module draw from its supply."""
-        return np.asarray(self._magnet_w * (self.relays % 3 != 0).sum(axis=1))
+        return np.asarray(self._magnet_w * (np.take(RELAY, self.relays) != 0.0).sum(axis=1))
 
     def current_ma(self) -> np.ndarray:
         """(m, 6) present current of every coil, without measurement noise."""
@@ -178,7 +178,8 @@ class Docks:
         self.faces.inside[i, j], self.faces.stop[i, j] = 1.0, 0.0
 
     def _coils(self, elapsed_s: float) -> None:
-        wanted = np.array(RELAY)[self.relays]
+        """Lets the coil currents follow their relays and the surges of switching decay."""
+        wanted = np.take(RELAY, self.relays)
         self.faces.coil[:] += (wanted - self.faces.coil) * -math.expm1(-elapsed_s / self.spec.coil_lag_s)
         self._surge *= math.exp(-elapsed_s / self.spec.surge_s)
         self.busy = bool(self.relays.any() or np.abs(self.faces.coil).max() > 1e-9)

@@ -98,7 +98,7 @@ def fault_state(nodes: Nodes) -> list[object]:
         world.set_command(mcu.module, [0.5] * 8)
     levels = world._thrusters.level[:, 0].tolist(), world._thrusters.constants[:, 0].tolist()
     supply = world._thrusters.supply[:, 1].tolist()
-    told = [(m.frozen, m.leaks, m.readings_absent) for m in mcus]
+    told = [(m.imu_frozen, m.leaks, m.readings_absent) for m in mcus]
     depths = [(m.depth.frozen, m.depth.absent, round(m.depth.error_m(1.0), 2)) for m in mcus]  # a drift begins at its own time
     return [*levels, supply, world.docks.relays.tolist(), world.push.tolist(), world.jet_strength, told, depths]
 
@@ -161,7 +161,7 @@ def test_fault_of_one_module_leaves_the_other_whole() -> None:
     nodes = nodes_with(Fault(kind="imu_frozen", module=2), Fault(kind="thruster_dead", module=1), scenario="dock")
     for tick in range(1, 50):
         nodes.step([sync(tick), *thrust(0.5, ARMED, tick), *thrust(0.5, ARMED, tick, number=2)])
-    assert [mcu.frozen for mcu in nodes.mcus.values()] == [False, True]
+    assert [mcu.imu_frozen for mcu in nodes.mcus.values()] == [False, True]
     assert not nodes.world.truth(0).force_n.any() and nodes.world.truth(1).force_n.all()
 
 
