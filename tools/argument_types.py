@@ -13,8 +13,12 @@ from pathlib import Path
 import typer
 from typer.exceptions import TyperException
 
-from firmware_py.description.schema import DescriptionError
+from firmware_py.description.fleet import Module
+from firmware_py.description.schema import DescriptionError, limits_of
 from hil.replaceable import check_replaceable, created_folder, is_json_with
+
+CELLS = limits_of(Module, "cell")
+"""Permitted places of a cell along each axis."""
 
 
 def whole(least: int) -> Callable[[str], int]:
@@ -40,9 +44,9 @@ def positive(text: str) -> float:
 
 
 def cells_in(text: str) -> list[tuple[int, int, int]]:
-    """Parses lattice cells such as "0,0,0 1,0,0", at least one. Raises ValueError."""
+    """Parses lattice cells such as "0,0,0 1,0,0", at least one, with the places that a fleet file may hold. Raises ValueError."""
     cells = [(int(x), int(y), int(z)) for x, y, z in (word.split(",") for word in text.replace(";", " ").split())]
-    if not cells:
+    if not cells or not all(CELLS.permits(place) for cell in cells for place in cell):
         raise ValueError
     return cells
 
@@ -79,8 +83,11 @@ def check_results(out: Path, key: str, *results: str) -> None:
 
 def make_room(out: Path) -> None:
     """Creates the folder of the file `out` and checks that it is writable. Raises DescriptionError."""
-    if out.is_dir():
-        raise DescriptionError(f"--out {out}: is a folder; a file is needed")
+    try:
+        if out.is_dir():
+            raise DescriptionError(f"--out {out}: is a folder; a file is needed")
+    except OSError as error:  # the name is too long
+        raise DescriptionError(f"--out {out}: cannot be written: {error.strerror}") from None
     _try_folder(out.parent, out)
 
 

@@ -18,7 +18,7 @@ from command_line import run_tool
 
 import numpy as np
 import typer
-from argument_types import cells_in, check_folder, make_room, run_command
+from argument_types import CELLS, cells_in, check_folder, make_room, run_command
 from rich import box
 from rich.console import Console
 from rich.table import Table
@@ -68,7 +68,7 @@ def parse_cells(text: str) -> list[Cell]:
     try:
         return cells_in(text)
     except ValueError:
-        what = "write whole numbers x,y,z with spaces between modules, as 0,0,0 1,0,0"
+        what = f"write whole numbers x,y,z, each from {CELLS.low:g} to {CELLS.high:g}, with spaces between modules, as 0,0,0 1,0,0"
         raise DescriptionError(f"cells {text!r}: {what}") from None
 
 

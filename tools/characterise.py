@@ -22,7 +22,7 @@ from command_line import Parser, refuse, run_tool
 import characterise_blas  # noqa: F401
 import characterise_table as table
 import numpy as np
-from argument_types import cells_in, check_results, folder_for_results, positive, whole
+from argument_types import CELLS, cells_in, check_results, folder_for_results, positive, whole
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
@@ -159,7 +159,7 @@ def _cells(shape: str) -> list[tuple[int, int, int]]:
     except ValueError:
         found = []
     if not 1 <= len(found) <= LARGEST_BOX:
-        what = "needs AxBxC, cells such as '0,0,0 1,0,0', or a fleet file (.toml)"
+        what = f"needs AxBxC, cells such as '0,0,0 1,0,0', each number from {CELLS.low:g} to {CELLS.high:g}, or a fleet file (.toml)"
         raise DescriptionError(f"--assembly {shape!r}: {what}; {LARGEST_BOX} modules at most")
     return found
 

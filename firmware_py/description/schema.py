@@ -9,6 +9,7 @@ import dataclasses
 import difflib
 import io
 import math
+import os
 import re
 import tomllib
 import types
@@ -179,7 +180,7 @@ def parse_toml(text: str, path: str) -> dict[str, Any]:
 
 def refuse_folder(name: str) -> None:
     """Raises DescriptionError if `name`, which should be a shipped name or a file, is a folder."""
-    if Path(name).is_dir():
+    if os.path.isdir(name):  # Path.is_dir raises where the name is too long
         raise DescriptionError(f"{name}: is a folder; give a .toml file")
 
 

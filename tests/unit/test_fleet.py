@@ -159,5 +159,10 @@ def test_vehicle_file_that_lies_nowhere_is_looked_for_beside_the_fleet_s(tmp_pat
         read_fleet(written(tmp_path, text))
 
 
+def test_vehicle_file_with_a_name_too_long_is_refused_with_its_line(tmp_path: Path) -> None:
+    with pytest.raises(DescriptionError, match=r"fleet\.toml:5: module\[0\]\.vehicle: .*x\.toml: cannot be read: File name too long$"):
+        load(tmp_path, f'buses = ["virtual:a"]\n\n[[module]]\nnumber = 7\nvehicle = "{"x" * 300}.toml"\n')
+
+
 def test_same_number_on_two_buses_is_two_modules(tmp_path: Path) -> None:
     assert len(load(tmp_path, TWO).module) == 2

@@ -70,6 +70,8 @@ def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys
         ),
         ("mutants", ["nosuch"], "mutants: nosuch: unknown; there are transitions, "),
         ("characterise", ["nosuch"], "characterise: vehicle 'nosuch' is unknown; there are "),
+        ("characterise", ["x" * 300], "characterise: vehicle 'xxx"),
+        ("characterise", ["--assembly", "0,0,0 0,0,65"], "characterise: --assembly '0,0,0 0,0,65': needs AxBxC, cells such as "),
         ("bus_load", ["--dbc", str(TOOLS / "bus_load.py")], f"bus_load: {TOOLS / 'bus_load.py'}: is a file; a folder is needed"),
         ("generate_mcu_code", [__file__], f"generate_mcu_code: {__file__}: is a file; a folder is needed"),
         ("run_tests", ["hover"], "run_tests: 'hover' is none of SYSTEM_PACKAGES in the Makefile; for single tests: "),
@@ -125,6 +127,12 @@ def test_every_tool_that_reads_arguments_ends_alike(tool: str) -> None:
         (
             "build_drag_table", ["--vehicle", "bluerov2", "--cache", "/proc/self/none"],
             "build_drag_table: line of two of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --",
+        ),
+        ("build_drag_table", ["--vehicle", "x" * 300], "build_drag_table: vehicle 'xxx"),
+        ("build_drag_table", ["--out", "x" * 300 + ".png"], "build_drag_table: --out xxx"),
+        (
+            "build_drag_table", ["--cells", "0,0,99999999999999999999"],
+            "build_drag_table: cells '0,0,99999999999999999999': write whole numbers x,y,z, each from -64 to 64, with spaces ",
         ),
         ("build_drag_table", ["--out", "x.foo"], "build_drag_table: --out x.foo: no picture ends in .foo; there are "),
         ("accept", ["--out", "/proc/self/accept.json"], "accept: --out /proc/self/accept.json: cannot be written: "),

@@ -220,6 +220,7 @@ def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
         ("direction = [0.7071067811865476, -0", "direction = [0.9, -0", r":\d+: thruster\[0\]: .* has not length 1"),
         ("quaternion = [1.0, 0.0, 0.0", "quaternion = [1.0, 0.5, 0.0", r":\d+: tag\[5\]: .* has not length 1"),
         ("id = 3", "id = 2", r"odd.toml:90: two \[\[tag\]\] tables have the same id"),
+        ("[hull]", f'[hull]\nmesh = "{"x" * 300}"', r"odd.toml:\d+: hull.mesh: .*: there is no such mesh"),
         ('faces = "PDPDPD"', 'faces = "PDPD"', "odd.toml:5: faces 'PDPD' needs six letters out of P, D and -"),
         ('faces = "PDPDPD"', 'faces = "PDPDPX"', "needs six letters out of P, D and -"),
         ("dry_kg = 2.6", "dry_kg = 0.0", r"inertial.dry_kg: 0.0 is out of range; permitted: 0.01 to 5000 kg"),
