@@ -62,7 +62,7 @@ class Flown(NamedTuple):
 
 
 class Result(NamedTuple):
-    """The result of a run. result.json holds all of it but `no_tag_reason`."""
+    """The result of a run. result.json holds all of it but the last two."""
 
     scenario: str
     seed: int
@@ -76,6 +76,8 @@ class Result(NamedTuple):
     flown: Flown = Flown()
     no_tag_reason: str = ""
     """Why no tag was seen, in words, if the flight could not be flown for that reason."""
+    unmet_faults: tuple[str, ...] = ()
+    """Faults that never began, because the flight ended before its time; a line each."""
 
     @property
     def seed_and_options(self) -> str:

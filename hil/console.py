@@ -134,10 +134,10 @@ def warning_lines(warnings: Sequence[str]) -> list[str]:
 
 
 def print_result(result: Result, report: Path | None = None, console: Console | None = None) -> None:
-    """Prints the table, the firmware's warnings, the verdict in one line, and the path of the report."""
+    """Prints the table, the firmware's warnings, faults that never began, the verdict in one line, and the path of the report."""
     console = console or Console()
     console.print(result_table(result))
-    for line in warning_lines(result.warnings):
+    for line in (*warning_lines(result.warnings), *result.unmet_faults):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     failed = [shown(c.name).label for c in result.checks if not c.passed]
     verdict = f"FAILED: {'; '.join(failed)}" if failed else "passed" if result.passed else "FAILED: nothing was checked"

@@ -140,7 +140,18 @@ def judge_logs(
         metrics |= force_metrics(scenario, folder, begin_ns)
     always = [Limit("unmatched_ticks", high=math.floor(lost_share * len(flight.firmware["tick"]))), *_armed_at_all(scenario, whole, folder)]
     result = judge(scenario.name, seed, metrics, [*scenario.check, *always], warning_lines(whole.events, start_of(whole)))
+    result = result._replace(unmet_faults=unmet_faults(scenario, whole))
     return result if result.passed else result._replace(no_tag_reason=no_tag_reason(scenario, whole))
+
+
+def unmet_faults(scenario: Scenario, whole: Flight) -> tuple[str, ...]:
+    """The faults that begin only after the end of the `whole` flight, in words; a dock's flight ends with its last step."""
+    end_ns = int(whole.ticks["time_ns"][-1]) - start_of(whole)
+    if scenario.task.kind != "dock" or end_ns >= scenario.task.end_ns:
+        return ()
+    over = f"never began: the steps were over at {1e-9 * end_ns:.1f} s, and the flight with them"
+    late = [fault for fault in scenario.fault if round(fault.at_s * 1e9) > end_ns]
+    return tuple(f"fault {f.kind}{f' of module {f.module}' if f.module else ''} at {f.at_s:g} s {over}" for f in late)
 
 
 def no_tag_reason(scenario: Scenario, whole: Flight) -> str:

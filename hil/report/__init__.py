@@ -224,9 +224,9 @@ def _table(result: Result) -> str:
 
 
 def _told(result: Result) -> str:
-    """Why no tag was seen and the firmware's warnings, shown under the table; empty if there is neither."""
+    """Why no tag was seen, faults that never began and the firmware's warnings, shown under the table; empty if there is none of them."""
     lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in result.warnings)
-    lacked = [f"<p>{html.escape(result.no_tag_reason)}</p>"] if result.no_tag_reason else []
+    lacked = [f"<p>{html.escape(line)}</p>" for line in (result.no_tag_reason, *result.unmet_faults) if line]
     return "\n".join([*lacked, *([f"<h3>{warnings_title(result.warnings)}</h3>\n<ul>\n{lines}\n</ul>"] if lines else [])])
 
 

@@ -19,7 +19,7 @@ from hil.console import print_result
 from hil.flight import judge_logs
 from hil.plant.fault_spec import Fault
 from hil.plant.spec import CameraPose
-from hil.scenario import load_scenario
+from hil.scenario import Step, load_scenario
 from tests.closed_loop.broken_vehicles import failed, reversed_thruster, turned_tags
 from tests.closed_loop.flights import Corrupt, Fly, Rebuild, shortened
 
@@ -204,3 +204,14 @@ def test_folder_holds_one_flight(fly: Fly, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_same_hover_unbroken_passes(fly: Fly) -> None:
     assert fly(shortened("hover", HOVER_S)).passed
+
+
+def test_fault_after_the_early_end_of_the_steps_is_told(fly: Fly, capsys: pytest.CaptureFixture[str]) -> None:
+    plan = load_scenario("dock")
+    faults = (Fault(kind="thruster_dead", at_s=0.5, module=1, index=0), Fault(kind="leak", at_s=100.0, module=2))
+    task = dataclasses.replace(plan.task, settle_s=1.0)
+    result = fly(dataclasses.replace(plan, step=(Step(do="wait", duration_s=0.5),), fault=faults, task=task))
+    told = "fault leak of module 2 at 100 s never began: the steps were over at 4.5 s, and the flight with them"
+    assert result.unmet_faults == (told,)
+    print_result(result)
+    assert f"{told}\n" in capsys.readouterr().out
