@@ -49,6 +49,8 @@ LARGEST_BOX = 64
 """Largest number of modules in an assembly."""
 LEAST_DIRECTIONS, MOST_DIRECTIONS = 121, 100_000
 """Limits of --directions: harmonics of degree ten have 121 coefficients."""
+LEAST_SIZE, MOST_SIZE = 1e-6, 1e6
+"""Permitted force, N, and torque, N m: the power curves overflow far beyond any thruster."""
 
 
 def main() -> int:
@@ -94,6 +96,9 @@ def arguments() -> argparse.Namespace:
         parser.error("--choose N and --task FILE go together")
     if not LEAST_DIRECTIONS <= given.directions <= MOST_DIRECTIONS:
         parser.error(f"--directions {given.directions}: permitted: {LEAST_DIRECTIONS} to {MOST_DIRECTIONS}")
+    for option, size in (("--force", given.force), ("--torque", given.torque)):
+        if not LEAST_SIZE <= size <= MOST_SIZE:
+            parser.error(f"{option} {size:g}: permitted: {LEAST_SIZE:g} to {MOST_SIZE:g}")
     return given
 
 
