@@ -39,6 +39,8 @@ from firmware_py.description.vehicle import ThrusterCurve, Vehicle, load_vehicle
 
 FARTHEST_M = 10.0
 """Largest distance from the hull's middle, as the vehicle file permits for its parts."""
+MOST_N, MOST_KG = 1e5, 1e4
+"""Largest weight in water and mass in air of what hangs on the robot: twice the heaviest vehicle that a file may describe."""
 RESULTS = ("identified.json", "vehicle.toml", "excite.toml")
 """Files that a run may leave in --out."""
 
@@ -60,6 +62,8 @@ def parse_weight(text: str, at_m: Sequence[float] | None = None) -> Weight:
         ) from None
     if not all(map(math.isfinite, (newton, kg, from_s, until_s))) or newton == 0.0 or kg < 0.0 or not 0.0 <= from_s < until_s:
         raise DescriptionError(f"--weight {text!r}: a weight other than 0, a mass of 0 or more, and a beginning before its end are needed")
+    if abs(newton) > MOST_N or kg > MOST_KG:
+        raise DescriptionError(f"--weight {text!r}: a weight of {MOST_N:g} N and a mass of {MOST_KG:g} kg at most are needed")
     if at_m is not None and not all(abs(m) <= FARTHEST_M for m in at_m):
         raise DescriptionError(f"--hung-at {' '.join(f'{m:g}' for m in at_m)}: three distances of {FARTHEST_M:g} m at most are needed")
     return Weight(newton, kg, from_s, until_s, None if at_m is None else (at_m[0], at_m[1], at_m[2]))

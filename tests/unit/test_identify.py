@@ -148,7 +148,7 @@ def test_motion_that_needs_no_room_along_x_takes_none(motion: str) -> None:
     "text",
     [
         "2.0", "2.0:0.2:60", "2:0.2:60:120:1", "a:b:c:d", "0:0.2:60:120", "2:0.2:120:60", "nan:0.2:60:120", "inf:0.2:60:120",
-        "2:nan:60:120", "2:inf:60:120", "2:0.2:60:inf",
+        "2:nan:60:120", "2:inf:60:120", "2:0.2:60:inf", "1e300:0.2:60:120", "-2e5:0.2:60:120", "2:1e300:60:120",
     ],
 )  # fmt: skip
 def test_weight_that_makes_no_sense_is_refused(text: str) -> None:
