@@ -131,12 +131,13 @@ def print_findings(found: Sequence[Finding]) -> None:
 
 
 def write_results(out: Path, texts: Mapping[str, str]) -> None:
-    """Writes the RESULTS in `texts` and deletes the others, so that all files there are of one run."""
+    """Writes the RESULTS in `texts` and deletes the others, so that all files there are of one run; prints what it deletes."""
     for name in RESULTS:
         if name in texts:
             (out / name).write_text(texts[name], encoding="utf-8")
-        else:
-            (out / name).unlink(missing_ok=True)
+        elif (out / name).exists():
+            (out / name).unlink()
+            print(f"deleted: {out / name}, of an earlier run")
 
 
 def identify(given: argparse.Namespace) -> int:

@@ -287,11 +287,12 @@ def test_excitation_is_said_how_to_fly_and_writes_over_nothing(
     assert (tmp_path / "first shake.toml").read_text(encoding="utf-8") == "mine"
 
 
-def test_result_of_an_earlier_log_does_not_stay_beside_that_of_another(tmp_path: Path) -> None:
+def test_result_of_an_earlier_log_does_not_stay_beside_that_of_another(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tool.write_results(tmp_path, {"identified.json": "{}", "vehicle.toml": "of the first"})
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     tool.write_results(tmp_path, {"identified.json": "{}", "excite.toml": "of the second"})
     assert sorted(path.name for path in tmp_path.iterdir()) == ["excite.toml", "identified.json", "notes.txt"]
+    assert capsys.readouterr().out == f"deleted: {tmp_path / 'vehicle.toml'}, of an earlier run\n"
 
 
 @pytest.mark.parametrize("name", vehicle_names())
