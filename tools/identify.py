@@ -94,7 +94,8 @@ def reference_of(recording: Recording, thruster: int | None, accuracy_percent: f
 def check_fitted(vehicle: Vehicle) -> None:
     """Raises DescriptionError for a vehicle whose flights cannot be fitted, so that none is flown in vain."""
     if vehicle.drag.quadratic.size:
-        raise DescriptionError(f"vehicle {vehicle.name}: its drag is published damping; only cd_face and cd_edge can be fitted")
+        what = "its drag is published damping, and only cd_face and cd_edge can be fitted; give a file without drag.quadratic"
+        raise DescriptionError(f"vehicle {vehicle.name}: {what}")
     if not vehicle.tag:
         raise DescriptionError(f"vehicle {vehicle.name}: it carries no tag; without poses nothing can be identified")
 

@@ -257,7 +257,7 @@ def test_weight_that_neither_came_nor_went_is_refused(from_s: float, until_s: fl
         (["--excitation", "shake.toml", "--space", "0.6", "0.5", "inf"], "--space 0.6 0.5 inf: three distances of 0 m or more"),
         (["--excitation", "shake.toml", "--space", "0.6", "0.5", "0"], "--space 0.6 0.5 0 leaves no room along z"),
         (["--excitation", "shake"], "--excitation shake: a scenario's file is a .toml file; give shake.toml"),
-        (["--excitation", "shake.toml", "--vehicle", "bluerov2_heavy"], "vehicle bluerov2_heavy: its drag is published damping"),
+        (["--excitation", "shake.toml", "--vehicle", "bluerov2_heavy"], "give a file without drag.quadratic"),
         (["--excitation", "shake.toml", "--vehicle", "girona500"], "vehicle girona500: it carries no tag"),
         (["nowhere", "--excitation", "shake.txt"], "--excitation shake.txt: a scenario's file is a .toml file"),
         (["nowhere", "--space", "nan", "0.5", "0.3"], "--space nan 0.5 0.3"),
