@@ -124,7 +124,8 @@ def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) 
     """The vehicle file with the fitted values. The payload stays as described.
 
     The dry mass stays as weighed. Only the sum of rigid and added mass is observable: it is divided as in the file, with the same factor on
-    the rigid part along all axes. Quantities without a field (trim, individual gains) stay in the report.
+    the rigid part along all axes. The drag coefficients hold all of the drag, so no linear damping is left. Quantities without a field
+    (trim, individual gains) stay in the report.
     """
     old, body = vehicle.inertial, assemble_vehicle(vehicle)
     whole, own = np.diag(body.mass), np.diag(assemble_vehicle(dataclasses.replace(vehicle, payload=())).mass)
@@ -142,8 +143,9 @@ def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) 
     face, edge = fit.value("drag")
     spun = float(np.mean(fit.value("rotational") / body.drag.rotational)) if body.drag.rotational.all() else 1.0
     drag = dataclasses.replace(
-        vehicle.drag, cd_face=float(face), cd_edge=float(edge), rotational_cd=max(0.0, vehicle.drag.rotational_cd * spun)
-    )
+        vehicle.drag, cd_face=float(face), cd_edge=float(edge), rotational_cd=max(0.0, vehicle.drag.rotational_cd * spun),
+        linear=np.zeros(6),
+    )  # fmt: skip
     curve = dataclasses.replace(
         curve,
         forward=frozen_array(curve.forward * gain),

@@ -304,6 +304,14 @@ def test_vehicle_that_is_written_is_the_vehicle(name: str, tmp_path: Path) -> No
     assert to_toml(again) == to_toml(vehicle)
 
 
+def test_linear_damping_is_counted_once() -> None:
+    """The coefficients are fitted to all of the drag, so what is linear in the file before is in them."""
+    described = load_vehicle("modcube")
+    vehicle = dataclasses.replace(described, drag=dataclasses.replace(described.drag, linear=np.full(6, 3.0)))
+    found = quantities.fitted_vehicle(SimpleNamespace(value=model.initial_values(vehicle).get), vehicle, vehicle.curve, "none")
+    np.testing.assert_array_equal(found.drag.linear, np.zeros(6))
+
+
 @pytest.mark.parametrize("loads", [0, 1, 2])
 def test_what_a_vehicle_carries_is_written_once(loads: int) -> None:
     """A fit that changed nothing gives the vehicle unchanged."""
