@@ -157,7 +157,9 @@ class CommandService:
     def _arm(self, command: Command) -> Answer:
         subject = self._system.subject
         forced = int(command.get(2)) in _FORCED
-        if command.get(1) < 0.5:
+        if command.get(1) not in (0.0, 1.0):
+            return self._deny_switch(command)
+        if command.get(1) == 0.0:
             return self._ask(command, Action.DISARM, forced, lambda: not subject.picture.is_armed(subject.leader))
         return self._ask(command, Action.ARM, forced, lambda: subject.armed)
 
@@ -231,7 +233,13 @@ class CommandService:
         return self._ask(command, Action.CLEAR_ESTOP, None, lambda: not s.picture.is_stopped(s.body))
 
     def _terminate(self, command: Command) -> Answer:
-        return self._estop(command) if command.get(1) >= 0.5 else self._clear_estop(command)
+        if command.get(1) >= 0.5:
+            return self._estop(command)
+        return self._clear_estop(command) if command.get(1) == 0.0 else self._deny_switch(command)
+
+    def _deny_switch(self, command: Command) -> Answer:
+        """Denies a command that is neither on nor off: whoever sent it may mean either."""
+        return self._accept_or_refuse(f"its parameter 1 is {command.get(1):g}; it needs 0 or 1", f"command {command.number}", DENIED)
 
     def _reboot(self, command: Command) -> Answer:
         if int(command.get(1)) not in (1, 3):

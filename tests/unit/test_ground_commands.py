@@ -51,6 +51,17 @@ def test_command_that_does_not_say_what_is_denied(world: World, client: Client, 
     assert len(world.robot.asked) == before
 
 
+@pytest.mark.parametrize(("number", "value"), [(400, 2.0), (400, -1.0), (400, 0.4), (185, 0.4), (185, -1.0)])
+def test_number_other_than_nought_and_one_neither_arms_nor_disarms_nor_clears(
+    world: World, client: Client, number: int, value: float
+) -> None:
+    before = len(world.robot.asked)
+    assert ask(world, client, number, value) == mavlink.MAV_RESULT_DENIED
+    assert len(world.robot.asked) == before
+    told = "".join(message.text for message in client.all("STATUSTEXT"))
+    assert f"command {number} refused: its parameter 1 is {value:g}; it needs 0 or 1" in told
+
+
 @pytest.mark.parametrize(("speed", "answer"), [(0.0, 2), (0.009, 2), (0.02, 0), (2.0, 0), (2.1, 2), (-1.0, 0), (-2.0, 0), (-0.5, 2)])
 def test_speed_that_would_never_arrive_is_denied(world: World, client: Client, speed: float, answer: int) -> None:
     assert ask(world, client, 178, 1, speed) == answer
