@@ -1,6 +1,7 @@
-"""Time to collision of each body with the others, if all moved on as they do now: a figure of the health (`collision_s`).
+"""Time to collision of each body with the others: a figure of the health (`collision_s`).
 
-A hull counts as the upright cylinder about its box as it is turned now.
+All bodies move on as they do now; and each, besides, as its guidance wants to: one that waits before another would reach it as soon as it
+goes on. A hull counts as the upright cylinder about its box as it is turned now.
 """
 
 from __future__ import annotations
@@ -22,13 +23,18 @@ CLOSING_M_S = 0.08
 
 
 def times_to_collision(
-    bodies: Sequence[Body], estimates: Mapping[int, Estimate], docking: Collection[tuple[int, int]] = ()
+    bodies: Sequence[Body],
+    estimates: Mapping[int, Estimate],
+    wanted_w: Mapping[int, np.ndarray],
+    pairs: Collection[tuple[int, int]] = (),
 ) -> dict[int, float]:
-    """Time in which each body reaches another that it moves towards, s, by its number; NaN if there is none, 0 if it is there already.
+    """Time in which each body reaches another towards which it moves, or wants to move, s, by its number; NaN if there is none, 0 if it is
+    there already.
 
     Args:
         estimates: by number of the body. A body whose place is unknown is left out.
-        docking: numbers of the bodies of each dock under way: these are to touch.
+        wanted_w: by number, the (3,) velocity in the world that guidance wants, m/s.
+        pairs: numbers of two bodies each that are no obstacles to each other, because they dock.
     """
     placed = [body for body in bodies if estimates[body.index].placed]
     times = dict.fromkeys((body.index for body in bodies), math.nan)
@@ -36,13 +42,15 @@ def times_to_collision(
         return times
     numbers = [body.index for body in placed]
     ignored = np.eye(len(placed), dtype=np.bool_)
-    for pair in docking:
+    for pair in pairs:
         if set(pair) <= set(numbers):
             a, b = map(numbers.index, pair)
             ignored[a, b] = ignored[b, a] = True
     modules = [_in_world(*estimates[body.index][:3], body.r_bm, body.hull_m) for body in placed]
     of_body = np.repeat(np.arange(len(placed)), [len(body.modules) for body in placed])
-    soonest = _soonest(*map(np.concatenate, zip(*modules, strict=True)), of_body, ignored)
+    r_w, v_w, cylinder = map(np.concatenate, zip(*modules, strict=True))
+    wanted = np.array([wanted_w[number] for number in numbers])[of_body]
+    soonest = np.fmin(*(_soonest(r_w, own_w, v_w, cylinder, of_body, ignored) for own_w in (v_w, wanted)))
     return times | dict(zip(numbers, soonest.tolist(), strict=True))
 
 
@@ -80,17 +88,19 @@ def _within(excess, rate, speed2):  # type: ignore[no-untyped-def]
     return (-rate - math.sqrt(under_root)) / speed2, (-rate + math.sqrt(under_root)) / speed2
 
 
-@njit(f"{V}({M},{M},{M},int64[::1],boolean[:,::1])", cache=True)
-def _soonest(r_w, v_w, cylinder, of_body, ignored):  # type: ignore[no-untyped-def]
-    """(b,) the least time to collision over all pairs of modules of two bodies, s; NaN where there is none."""
+@njit(f"{V}({M},{M},{M},{M},int64[::1],boolean[:,::1])", cache=True)
+def _soonest(r_w, own_w, v_w, cylinder, of_body, ignored):  # type: ignore[no-untyped-def]
+    """(b,) the least time to collision over all pairs of modules of two bodies, s; NaN where there is none. Each body moves at `own_w`,
+    (m, 3), while the others move at `v_w`, (m, 3).
+    """
     out = np.full(ignored.shape[0], np.nan)
     for i in range(of_body.size):
         for j in range(of_body.size):
             if ignored[of_body[i], of_body[j]]:
                 continue
             north, east, down = r_w[j, 0] - r_w[i, 0], r_w[j, 1] - r_w[i, 1], r_w[j, 2] - r_w[i, 2]
-            v_n, v_e, v_d = v_w[j, 0] - v_w[i, 0], v_w[j, 1] - v_w[i, 1], v_w[j, 2] - v_w[i, 2]
-            own = north * v_w[i, 0] + east * v_w[i, 1] + down * v_w[i, 2]
+            v_n, v_e, v_d = v_w[j, 0] - own_w[i, 0], v_w[j, 1] - own_w[i, 1], v_w[j, 2] - own_w[i, 2]
+            own = north * own_w[i, 0] + east * own_w[i, 1] + down * own_w[i, 2]
             level_rate, down_rate, level2, down2 = north * v_n + east * v_e, down * v_d, north**2 + east**2, down**2
             if level_rate + down_rate < 0.0 and own > CLOSING_M_S * math.sqrt(level2 + down2):  # not where it is NaN
                 radius_m, height_m = cylinder[i, 0] + cylinder[j, 0], cylinder[i, 1] + cylinder[j, 1]

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 BROKEN_NS = 5_000_000_000
 """How long a DISARM of a body that came apart by itself stops all its pieces: a person who sees it break means the whole, and takes a few
 seconds (synthetic) to see it and to act."""
+PARTED_NS = 3_000_000_000
+"""How long the two pieces of an undock are no obstacles to each other: magnets and thrusters push them off and back for two seconds
+before they glide to their places."""
 
 
 class Formation:
@@ -32,6 +35,8 @@ class Formation:
         """The present parameters; bodies still in preparation get them when they begin."""
         self._broken: list[tuple[int, Body]] = []
         """Bodies that came apart by themselves, and when; those older than BROKEN_NS are forgotten at the next one."""
+        self._parted: list[tuple[int, tuple[int, int]]] = []
+        """Numbers of the two pieces of bodies that parted in the last PARTED_NS, and when."""
         self._watch_joints()
 
     @property
@@ -72,9 +77,12 @@ class Formation:
             self._part(parted, inputs.time_ns, estimates)
         outputs.events += self.docking.events
 
-    def watch_distances(self, estimates: dict[int, Estimate]) -> None:
-        """Tells each body's health in which time it reaches another. Docks and undocks have their own right of way."""
-        times_s = times_to_collision(self.bodies, estimates, self.docking.pairs)
+    def watch_distances(self, time_ns: int, estimates: dict[int, Estimate]) -> None:
+        """Tells each body's health in which time it reaches another. Two that dock or have just parted are no obstacles to each other."""
+        self._parted = [parted for parted in self._parted if time_ns - parted[0] <= PARTED_NS]
+        wanted_w = {pipeline.body.index: pipeline.guidance.wanted_w for pipeline in self.pipelines}
+        pairs = [*self.docking.pairs, *(pieces for _, pieces in self._parted)]
+        times_s = times_to_collision(self.bodies, estimates, wanted_w, pairs)
         for pipeline in self.pipelines:
             pipeline.health.collision_s = times_s[pipeline.body.index]
 
@@ -154,6 +162,7 @@ class Formation:
         after = [parted.stays, parted.leaves]
         before = self._pipelines_of(parted.whole)
         self._broken = self._broken_lately(time_ns) + [(time_ns, whole.body) for whole in before if whole.parting]
+        self._parted.append((time_ns, (parted.stays.body.index, parted.leaves.body.index)))
         found = [self._begin(pipeline, before, time_ns) for pipeline in after]
         parted.leaves.guidance.move_by(parted.away_w)
         self._swap(before, after, estimates, found)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core.body import Body
+from firmware_py.core.failsafes import FREE, Level
 from firmware_py.core.health import Health
 from firmware_py.core.rotations import difference, heading, rotate, rotate_back
 from firmware_py.core.setpoint import REST, Glider, Trajectory, Wish, ahead_of, at_estimate, on_leash, rest_at
@@ -96,6 +97,8 @@ class Guidance:
         """Whether the mode has changed since, so that a new blend begins at `_wrench`."""
         self._offset, self._offset_ns = np.zeros(6), 0
         """Wrench of the mode before less that of the new one, (6,), when the mode changed, and that time: it fades out from then on."""
+        self.wanted_w = ZERO
+        """(3,) velocity, world, m/s, at which this body would move if no other were in its way; only where it then stops before others."""
         self.mode = Mode.POSHOLD
 
     def retune(self, parameters: Parameters) -> None:
@@ -103,7 +106,9 @@ class Guidance:
         p, t = parameters.steering, self._body.thrusters
         self._p, self._fence = p, parameters.fence
         self._lead_s = parameters.control.lead_s
-        self._no_place_s, self._no_depth_s = parameters.failsafes.tag_lost_limit, parameters.failsafes.depth_unknown_limit
+        f = parameters.failsafes
+        self._no_place_s, self._no_depth_s = f.tag_lost_limit, f.depth_unknown_limit
+        self._least_s = f.collision_limit if f.collision_action >= Level.HOLD else 0.0
         self._full_stick = p.stick_share * (0.5 * np.abs(t.matrix) @ (t.f_max - t.f_min))
         self._lift_n = p.surface_force_n * len(self._body.modules)
         depth_m = self._body.r_bm[:, 2]
@@ -214,6 +219,7 @@ class Guidance:
 
     def step(self, time_ns: int, estimate: Estimate, health: Health) -> tuple[Setpoint, Setpoint]:
         """Returns the set-point at `time_ns`, and the one `lead_s` later, for the feed-forward."""
+        self.wanted_w = ZERO
         dt_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) * 1e-9
         self._time_ns = time_ns
         if dt_s > STILL_S:
@@ -228,7 +234,7 @@ class Guidance:
         if self.mode == Mode.DOCK and isinstance(self._docking, Setpoint):
             self._glider.put(self._docking)
             return self._docking, ahead_of(self._docking, self._lead_s)
-        wish = self._wish(time_ns)
+        wish = self._stopped_before_others(self._wish(time_ns), health)
         was_rate_commanded = self._was_rate_commanded
         self._was_rate_commanded = self.mode == Mode.GUIDED or bool(wish.v_w.any() or wish.w_b.any())
         if self._was_rate_commanded:  # by requested speeds, while something may hold the body back
@@ -287,6 +293,16 @@ class Guidance:
             return self._goal
         v_w = np.asarray(rotate(at.q_wb, p.speed_m_s * np.array(sticks.force)))
         return Wish(self._velocity_in_fence(at.p_wb, v_w), rate)
+
+    def _stopped_before_others(self, wish: Wish, health: Health) -> Wish:
+        """Returns the wish, or rest where it leads to another body in too short a time; keeps the velocity that was wanted."""
+        if self.mode not in FREE or self._least_s == 0.0:
+            return wish
+        self.wanted_w = wish.v_w
+        if wish.p_wb is not None:
+            way = np.nan_to_num(wish.p_wb - self._glider.at.p_wb)
+            self.wanted_w = wish.v_w + way / max(self._least_s, float(np.linalg.norm(way)) / self._p.speed_m_s)
+        return REST if health.collision_s < self._least_s else wish
 
     def _guided(self, time_ns: int) -> Wish:
         """Returns the newest streamed set-point, extrapolated by its own speed; it stops after `guided_timeout_s` without a newer one."""

@@ -232,7 +232,7 @@ class Pipeline:
         estimates = {pipeline.body.index: pipeline.measure(inputs) for pipeline in formation.pipelines}
         before = formation.bodies_known(inputs.time_ns)
         formation.step(inputs, estimates, outputs)
-        formation.watch_distances(estimates)
+        formation.watch_distances(inputs.time_ns, estimates)
         bodies = {body.index: body for body in formation.bodies}
         requests, refusals = sift(follow(inputs.requests, before, bodies), bodies)
         outputs.events += refusals

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from firmware_py.core.body import Body
 from firmware_py.core.collision import CLOSING_M_S, times_to_collision
 from firmware_py.core.rotations import from_euler, rotate_back
-from firmware_py.core.types import NEVER_AGE_NS, Action, Estimate, Mode, Request, Setpoint
+from firmware_py.core.types import NEVER_AGE_NS, Action, Estimate, Mode, Request, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.prepare.assembly import PITCH_M, assemble, assemble_vehicle
 from tests.unit.tanks import MODCUBE, FaultyTank
@@ -31,9 +31,13 @@ def at(place: Sequence[float], velocity: Sequence[float] = (0.0, 0.0, 0.0), turn
     return here._replace(**changes)
 
 
-def pair(first: Estimate, second: Estimate, docking: tuple[tuple[int, int], ...] = ()) -> tuple[float, float]:
+def pair(
+    first: Estimate, second: Estimate, pairs: tuple[tuple[int, int], ...] = (), wanted: Sequence[float] = (0.0, 0.0, 0.0)
+) -> tuple[float, float]:
+    """Times of bodies 0 and 5; `wanted`: velocity that the guidance of body 0 wants."""
     bodies = [single(0), single(5)]
-    return tuple(times_to_collision(bodies, {0: first, 5: second}, docking).values())  # type: ignore[return-value]
+    times_s = times_to_collision(bodies, {0: first, 5: second}, {0: np.array(wanted), 5: ZERO}, pairs)
+    return times_s[0], times_s[5]
 
 
 def test_time_is_the_gap_over_the_closing_speed() -> None:
@@ -103,9 +107,19 @@ def test_bodies_that_are_within_reach_and_still_close_in_have_no_time_left() -> 
 
 def test_pair_that_docks_is_to_touch_and_a_third_body_is_not() -> None:
     moving, waiting = at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0])
-    for docking in (((0, 5),), ((5, 0),)):
-        assert np.isnan(pair(moving, waiting, docking)).all()
+    for pairs in (((0, 5),), ((5, 0),)):
+        assert np.isnan(pair(moving, waiting, pairs)).all()
     assert pair(moving, waiting, ((0, 7), (7, 5)))[0] > 0.0
+
+
+def test_body_that_waits_before_another_has_the_time_that_it_would_need() -> None:
+    first, other = at(ZERO), at([1.0, 0.0, 0.0])
+    assert pair(first, other, wanted=(0.2, 0.0, 0.0)) == pytest.approx(((1.0 - TOUCH_M) / 0.2, math.nan), nan_ok=True)
+    assert math.isnan(pair(first, other, wanted=(-0.2, 0.0, 0.0))[0]), "it wants to leave"
+    assert math.isnan(pair(first, other, wanted=(0.0, 0.2, 0.0))[0]), "it wants to go aside"
+    moving = at(ZERO, [0.1, 0.0, 0.0])
+    assert pair(moving, other, wanted=(0.2, 0.0, 0.0))[0] == pytest.approx((1.0 - TOUCH_M) / 0.2)
+    assert pair(moving, other)[0] == pytest.approx((1.0 - TOUCH_M) / 0.1)
 
 
 def test_corner_of_a_turning_row_counts_with_its_own_speed() -> None:
@@ -113,13 +127,14 @@ def test_corner_of_a_turning_row_counts_with_its_own_speed() -> None:
     row, other = assemble([(-1, 0, 0), (0, 0, 0), (1, 0, 0)], [0] * 3, [MODCUBE] * 3, [1, 2, 3]), single(8)
     turning = at([0.0, 0.0, 1.0], turn=1.0)
     estimates = {1: turning, 8: at([PITCH_M, 0.6, 1.0])}
-    times = times_to_collision([row, other], estimates)
+    times = times_to_collision([row, other], estimates, {1: ZERO, 8: ZERO})
     assert times[1] == pytest.approx((0.6 - TOUCH_M) / PITCH_M, rel=1e-6)
     assert math.isnan(times[8])
 
 
 def test_vehicle_alone_has_nobody_to_meet() -> None:
-    assert np.isnan(list(times_to_collision([assemble_vehicle(MODCUBE)], {0: at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0])}).values()))
+    alone = at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0])
+    assert math.isnan(times_to_collision([assemble_vehicle(MODCUBE)], {0: alone}, {0: np.array([0.2, 0.0, 0.0])})[0])
 
 
 # ------------------------------------------------------------ whole ticks
@@ -150,6 +165,27 @@ def test_body_that_is_sent_through_another_stops_before_it(mode: Mode) -> None:
     assert TOUCH_M < distances(tank).min() < 0.6
     assert [record.mode for record in tank.outputs[-1].records] == [Mode.POSHOLD] * 2
     assert np.linalg.norm(tank.states[0][7:10]) < 0.01 and np.linalg.norm(tank.states[1][:3] - [1.2, 0.0, 0.8]) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("insists", ["stick", "place", "GUIDED"])
+def test_body_that_is_sent_on_and_on_waits_and_goes_on_when_the_way_is_free(insists: str) -> None:
+    """A stick held, or a request sent again ten times a second: each takes the body over from the fail-safe."""
+    tank = two_in_the_water(Parameters())
+    beyond, aside = (Setpoint(np.array([*place, 0.8]), LEVEL, ZERO, ZERO, ZERO, ZERO) for place in ((2.4, 0.0), (1.2, 1.0)))
+    asked = {
+        "stick": [Request(Action.STICKS, 0, Sticks((1.0, 0.0, 0.0), (0.0, 0.0, 0.0)))],
+        "place": [Request(Action.HOLD, 0, beyond)],
+        "GUIDED": [Request(Action.SET_POINT, 0, beyond), Request(Action.SET_MODE, 0, Mode.GUIDED)],
+    }[insists]
+    for _ in range(80):
+        tank.run(0.1, *asked)
+    assert tank.when("fail-safe on: another body is in the way")
+    assert distances(tank).min() > EDGE_M + 0.05 and np.linalg.norm(tank.states[0][7:10]) < 0.02
+    tank.run(0.1, Request(Action.HOLD, 1, aside), *asked)
+    for _ in range(80):
+        tank.run(0.1, *asked)
+    assert tank.states[0][0] > 2.0 and distances(tank).min() > EDGE_M + 0.05
 
 
 @pytest.mark.slow

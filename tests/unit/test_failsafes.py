@@ -233,7 +233,7 @@ WORDS = {
     "module_silent": "a module is silent for 0.5 s",
     "ticks_missed": "ticks missed: 5 in a second",
     "fence": "outside the fence by 0.00 m",
-    "collision": "another body is in the way: 0.5 s",
+    "collision": "another body is in the way, 0.5 s away",
     "ground_lost": "ground station silent for 5.0 s",
     "pilot_lost": "pilot silent for 1.0 s",
     "thruster_lost": "a thruster is out",
