@@ -164,6 +164,30 @@ def _in_docked(scenario: Scenario) -> Iterator[Mistake]:
                     yield ("module", m, key), f"{what}; leave it out, or give the cell"
 
 
+def _in_cells(scenario: Scenario) -> Iterator[Mistake]:
+    """Checks that only modules of a body have a cell: one whose `body` was forgotten would start alone, somewhere else."""
+    for m, module in enumerate(scenario.module):
+        if module.body < 0 and module.cell.any():
+            what = f"module {module.number} starts alone, in no lattice; give body, as its neighbours have, or leave it out"
+            yield ("module", m, "cell"), what
+
+
+def _in_undocks(scenario: Scenario) -> Iterator[Mistake]:
+    """Checks that the modules of an undock start docked, or that earlier steps dock their bodies."""
+    if scenario.polycube is not None:
+        return
+    bodies = [{scenario.module[m].number for m in members} for members in scenario.groups]
+    for i, step in enumerate(scenario.step):
+        if step.do not in ("dock", "undock"):
+            continue
+        joined = [body for body in bodies if body & set(step.modules)]
+        if step.do == "dock":
+            bodies = [body for body in bodies if body not in joined] + [set().union(*joined)]
+        elif len(joined) > 1:
+            what = f"modules {step.module} and {step.target_module} are not docked: neither at the start nor by an earlier step"
+            yield ("step", i, "do"), f"{what}; name two that are"
+
+
 def _in_tank(scenario: Scenario) -> Iterator[Mistake]:
     """Checks the start and target positions of bodies; the script checks whether whole paths stay in the tank."""
     places: list[tuple[str, int]] = [("module", members[0]) for members in scenario.groups]
@@ -285,7 +309,7 @@ def _out_of_reach(check: Check) -> Iterator[tuple[str, str]]:
 
 
 RULES = (
-    _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_clamps, _in_docked, _in_tank, _in_moves,
-    _in_start, _in_mentions, _in_faces, _in_tags, _in_faults, _in_checks,
+    _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_clamps, _in_docked, _in_cells, _in_tank,
+    _in_moves, _in_start, _in_mentions, _in_faces, _in_undocks, _in_tags, _in_faults, _in_checks,
 )  # fmt: skip
 """In order of priority: the first mistake found is the one reported."""

@@ -53,6 +53,12 @@ def load(tmp_path: Path) -> Load:
     ("name", "old", "new", "refusal"),
     [
         ("dock", SECOND, "", "task.kind: dock needs two modules at least"),
+        ("dock", 'do = "dock"', 'do = "undock"', "step[0].do: modules 2 and 1 are not docked: neither at the start nor by an earlier step"),
+        (
+            "dock-third", 'do = "dock"\nmodule = 3', 'do = "undock"\nmodule = 3',
+            "step[0].do: modules 3 and 2 are not docked: neither at the start nor by an earlier step",
+        ),
+        ("dock-third", "body = 0\ncell = [1, 0, 0]", "cell = [1, 0, 0]", "module[1].cell: module 2 starts alone, in no lattice; give body"),
         ("dock", DOCK_STEP, "", "task.kind: dock runs the [[step]]s, and there are none"),
         ("dock", "target_module = 1", "target_module = 2", "step[0]: module and target_module are both 2"),
         ("dock", "target_module = 1", "target_module = 9", "step[0].target_module: no module has the number 9; there are 1, 2"),
