@@ -84,6 +84,10 @@ def load_fleet(path: Path) -> Fleet:
     if "buses" not in table:
         raise source.error(("buses",), 'missing key; it needs the bus of each index, such as ["socketcan:can0"]')
     fleet: Fleet = build(Fleet, table, source)
+    for i, module in enumerate(fleet.module):
+        if module.body < 0 and module.cell.any():  # with its body forgotten, a docked module would be flown as one alone
+            what = f"module number {module.number} starts alone, in no lattice; give body, or leave cell out"
+            raise DescriptionError(f"{path}:{source.line_of(('module', i, 'cell'))}: {what}")
     return dataclasses.replace(fleet, module=find_vehicles(fleet.module, source))
 
 

@@ -84,6 +84,10 @@ WRONG = {
     "rotation": ("[[module]]\nnumber = 2\nrotation = 24\n", r"fleet.toml:4: module\[0\].rotation: 24 is out of range"),
     "half a rate": ("rate_hz = 99.5\n[[module]]\nnumber = 2\n", r"rate_hz: 99.5 is not a whole number"),
     "half a cell": ("[[module]]\nnumber = 2\ncell = [0.5, 0, 0]\n", r"cell \[0.5, 0.0, 0.0\] is between places of the lattice"),
+    "no body": (
+        "[[module]]\nnumber = 2\nbody = 0\n[[module]]\nnumber = 3\ncell = [1, 0, 0]\n",
+        "fleet.toml:7: module number 3 starts alone, in no lattice; give body, or leave cell out",
+    ),
     "one table": ("[module]\nnumber = 2\n", r"fleet.toml:2: module: must be a list of tables, each \[\[module\]\]"),
     "like another": ("[[module]]\nnummer = 2\n", r"module\[0\].nummer: unknown key; did you mean number\? permitted here: "),
     "cell": ("[[module]]\nnumber = 2\ncell = [1, 2]\n", r"module\[0\].cell: has 2 numbers; needs 3 numbers"),
