@@ -41,6 +41,16 @@ OWN_KEYS = {
     },
 }
 """Keys that not every kind of a table has, by kind; a dock with steps along the strip has those of moebius."""
+_PAIR = ("module", "face", "target_module", "target_face", "quarter_turns", "both_approach")
+STEP_KEYS = {
+    "dock": _PAIR,
+    "undock": _PAIR,
+    "move": ("module", "position_m", "duration_s"),
+    "moebius_start": ("module", "duration_s"),
+    "moebius": ("module", "duration_s"),
+    "wait": ("duration_s",),
+}
+"""Keys of a step, by what it does, besides `do` and `also`."""
 Mistake = tuple[tuple[str | int, ...], str]
 """Path of keys to the wrong entry, and the error message."""
 
@@ -52,7 +62,7 @@ def mistakes(scenario: Scenario) -> Iterator[Mistake]:
 
 
 def idle_keys(scenario: Scenario, given: Mapping[str, Any]) -> Iterator[Mistake]:
-    """Yields the keys `given` in its file that have no effect in the scenario."""
+    """Yields the keys `given` in its file that have no effect in the scenario, and moves without a target."""
     on_strip = scenario.task.kind == "dock" and any(step.do.startswith("moebius") for step in scenario.step)
     for table, kind, has in (
         ("tank", scenario.tank.kind, scenario.tank.kind), ("task", scenario.task.kind, "moebius" if on_strip else scenario.task.kind)
@@ -61,6 +71,12 @@ def idle_keys(scenario: Scenario, given: Mapping[str, Any]) -> Iterator[Mistake]
         for key in given[table]:
             if key in idle:
                 yield (table, key), f"a {table} of the kind {kind} has no {key}; leave it out, or give another kind"
+    for i, step in enumerate(given.get("step", ())):
+        for key in step:
+            if key not in ("do", "also", *STEP_KEYS[step["do"]]):
+                yield ("step", i, key), f"a {step['do']} has no {key}; leave it out"
+        if step["do"] == "move" and "position_m" not in step:
+            yield ("step", i, "position_m"), "a move needs it: where the body goes"
 
 
 def metric_names(scenario: Scenario) -> list[str]:
