@@ -9,12 +9,11 @@ import dataclasses
 import difflib
 import io
 import math
-import os
 import re
 import tomllib
 import types
 import typing
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -178,9 +177,17 @@ def parse_toml(text: str, path: str) -> dict[str, Any]:
         raise DescriptionError(f"{path}:{match.group(1) if match else last}: not valid TOML: {str(error).splitlines()[0]}") from None
 
 
+def is_there(path: Path, look: Callable[[Path], bool] = Path.exists) -> bool:
+    """Whether `look` finds something at `path`; not, where the name is too long for the file system, of which `look` itself raises."""
+    try:
+        return look(path)
+    except OSError:
+        return False
+
+
 def refuse_folder(name: str) -> None:
     """Raises DescriptionError if `name`, which should be a shipped name or a file, is a folder."""
-    if os.path.isdir(name):  # Path.is_dir raises where the name is too long
+    if is_there(Path(name), Path.is_dir):
         raise DescriptionError(f"{name}: is a folder; give a .toml file")
 
 

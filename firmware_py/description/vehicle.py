@@ -6,7 +6,6 @@ Positions and directions are in the module frame: FRD, origin at the hull's cent
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -22,6 +21,7 @@ from firmware_py.description.schema import (
     did_you_mean,
     frozen_array,
     is_file_name,
+    is_there,
     limits_of,
     quantity,
     read_toml,
@@ -278,7 +278,7 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
     _check_drag(vehicle.drag, source)
     if vehicle.hull.mesh:
         mesh = (path.parent / vehicle.hull.mesh).absolute()  # for logs, and for printing the vehicle as a file elsewhere
-        if not os.path.isfile(mesh):  # Path.is_file raises where the name is too long
+        if not is_there(mesh, Path.is_file):
             raise source.error(("hull", "mesh"), f"{mesh}: there is no such mesh")
         vehicle = dataclasses.replace(vehicle, hull=dataclasses.replace(vehicle.hull, mesh=str(mesh)))
     return vehicle
@@ -341,4 +341,4 @@ def find_vehicles(modules: Sequence[_Module], source: Source) -> tuple[_Module, 
 def _beside(folder: Path, name: str) -> str:
     """A vehicle's `name`; that of a file is prefixed with `folder`, unless the file exists in the working directory only."""
     path = folder / name
-    return str(path) if name.endswith(".toml") and (os.path.exists(path) or not os.path.exists(name)) else name
+    return str(path) if name.endswith(".toml") and (is_there(path) or not is_there(Path(name))) else name
