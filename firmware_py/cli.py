@@ -85,7 +85,7 @@ def run(
     """Run the vehicle until SIGINT, SIGTERM or SIGHUP."""
     from firmware_py.app.deadlines import stats_lines
     from firmware_py.app.live_view import LiveView
-    from firmware_py.app.vehicle import run_vehicle
+    from firmware_py.app.vehicle_process import run_vehicle
     from firmware_py.runtime.notify import Notifier
 
     if not live and (live_host is not None or live_port is not None):

@@ -30,7 +30,7 @@ EARLIEST_YEAR = 2024
 """Earliest plausible date: a Jetson without a clock battery starts in 1970."""
 SLOW_IMPORT_S = 8.0
 """Longest time to import the tick's code when all of it is compiled and cached."""
-WARM_MODULES = ("firmware_py.app.vehicle", "firmware_py.app.firmware")
+WARM_MODULES = ("firmware_py.app.vehicle_process", "firmware_py.app.firmware")
 """Modules whose import compiles everything that a tick calls, or loads it from the cache."""
 
 

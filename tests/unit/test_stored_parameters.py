@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from firmware_py.app import ground_station
-from firmware_py.app.vehicle import run_vehicle
+from firmware_py.app.vehicle_process import run_vehicle
 from firmware_py.description.fleet import single
 from firmware_py.description.parameters import Control, Parameters
 from firmware_py.description.schema import DescriptionError

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.app import vehicle
+from firmware_py.app import vehicle_process
 from firmware_py.app.estop_note import NOTE, EstopNote
-from firmware_py.app.vehicle import run_vehicle
+from firmware_py.app.vehicle_process import run_vehicle
 from firmware_py.bus.port import PortError
 from firmware_py.description.fleet import single
 from firmware_py.description.parameters import Parameters
@@ -21,7 +21,7 @@ from tests.unit.vehicle_runs import LOGS, content, fly
 
 def test_process_that_is_refused_a_folder_leaves_the_log_of_who_has_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two processes start at once, both before either has a log there."""
-    monkeypatch.setattr(vehicle, "make_log_folder", lambda out: out)
+    monkeypatch.setattr(vehicle_process, "make_log_folder", lambda out: out)
     note = EstopNote(tmp_path)
     log = Recorder(tmp_path, {})
     log.flush()

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.app import vehicle
+from firmware_py.app import vehicle_process
 from firmware_py.app.observers import recording
-from firmware_py.app.vehicle import run_vehicle
+from firmware_py.app.vehicle_process import run_vehicle
 from firmware_py.bus.codec import Frame
 from firmware_py.bus.port.links import VirtualLink
 from firmware_py.core.types import Event, Inputs, ModuleCommand, Outputs
@@ -54,7 +54,7 @@ def test_vehicle_that_is_stopped_while_it_starts_ends_without_a_tick_or_a_log(
         raise AssertionError(f"signal {number} ends the process here")
 
     said: list[str] = []
-    monkeypatch.setattr(vehicle, "read_libraries", lambda: os.kill(os.getpid(), number))
+    monkeypatch.setattr(vehicle_process, "read_libraries", lambda: os.kill(os.getpid(), number))
     with handled(die):
         summary = run_vehicle(single(bus=bus_of(tmp_path)), Parameters(), out=tmp_path / "log", say=said.append)
     assert summary.ticks == 0 and not any(line.startswith("running at") for line in said)
@@ -154,8 +154,8 @@ def test_libraries_are_read_when_all_is_composed_and_before_the_first_tick(tmp_p
     steps: list[str] = []
 
     def listed(name: str) -> None:
-        step = getattr(vehicle, name)
-        monkeypatch.setattr(vehicle, name, lambda *a, **k: (steps.append(name), step(*a, **k))[1])
+        step = getattr(vehicle_process, name)
+        monkeypatch.setattr(vehicle_process, name, lambda *a, **k: (steps.append(name), step(*a, **k))[1])
 
     for name in ("compose", "read_libraries", "open_loop"):
         listed(name)

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.app import vehicle
-from firmware_py.app.vehicle import Operator
+from firmware_py.app import vehicle_process
+from firmware_py.app.vehicle_process import Operator
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters, Supervision
 from firmware_py.runtime.clock import boot_id
@@ -95,7 +95,7 @@ def test_modules_that_were_undocked_in_flight_are_named_and_not_armed_as_one(
         to_arm.append(set(modules))
         return Operator(rate_hz, modules, *others)
 
-    monkeypatch.setattr(vehicle, "Operator", operator)
+    monkeypatch.setattr(vehicle_process, "Operator", operator)
     fleet = write_log_killed_in_flight(tmp_path, PAIR + UNDOCKED, docked(0, 1))
     said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet, hold=hold)
     bus = bus_of(tmp_path)

@@ -11,7 +11,7 @@ from firmware_py.app.firmware import compose
 from firmware_py.app.last_flight import last_flight, to_arm
 from firmware_py.app.observers import recording
 from firmware_py.app.realtime import RealTimeLoop
-from firmware_py.app.vehicle import FORGETFUL
+from firmware_py.app.vehicle_process import FORGETFUL
 from firmware_py.bus.codec import Codec, Frame
 from firmware_py.cli import main
 from firmware_py.core.transitions import State

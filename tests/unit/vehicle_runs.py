@@ -5,7 +5,7 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
-from firmware_py.app.vehicle import run_vehicle
+from firmware_py.app.vehicle_process import run_vehicle
 from firmware_py.description.fleet import Fleet, single
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.notify import Notifier
