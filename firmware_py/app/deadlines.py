@@ -9,7 +9,7 @@ from firmware_py.app.firmware import BusFrame
 from firmware_py.app.observers import Observer
 from firmware_py.app.realtime import RealTimeLoop
 from firmware_py.core.types import Inputs, Outputs
-from firmware_py.ground.times import Times
+from firmware_py.ground.tick_times import Times
 from firmware_py.runtime.rate_keeper import COARSE_EDGES_NS, Histogram, RateKeeper
 from firmware_py.runtime.recorder import Recorder
 

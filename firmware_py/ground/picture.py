@@ -16,7 +16,7 @@ from firmware_py.core.rotations import rotate_back
 from firmware_py.core.transitions import ARMED, State
 from firmware_py.core.types import CHANNELS, FACES, NEVER_NS, BodyRecord, Estimate, Event, Inputs, Mode, ModuleInputs, Outputs
 from firmware_py.description.parameters import Supervision
-from firmware_py.ground.times import Times
+from firmware_py.ground.tick_times import Times
 
 ESC_SILENT = 3
 """EscStatus of an ESC that is not heard."""

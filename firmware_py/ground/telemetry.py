@@ -15,7 +15,7 @@ from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.ground.geodesy import Origin
 from firmware_py.ground.identity import TYPE_SUBMARINE, Identity, base_mode
 from firmware_py.ground.picture import ESC_SILENT, ModulePicture, Picture
-from firmware_py.ground.times import histograms, load_permille
+from firmware_py.ground.tick_times import histograms, load_permille
 
 Values = Mapping[str, Any]
 _NAN = math.nan

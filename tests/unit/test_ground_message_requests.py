@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from firmware_py.ground.dialect import load_dialect
 from firmware_py.ground.identity import px4
 from firmware_py.ground.telemetry import STREAMS
-from firmware_py.ground.times import Times
+from firmware_py.ground.tick_times import Times
 from tests.unit.ground_requests import ask
 from tests.unit.ground_world import Client, World
 
