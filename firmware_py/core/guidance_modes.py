@@ -98,7 +98,7 @@ class Guidance:
         self._offset, self._offset_ns = np.zeros(6), 0
         """Wrench of the mode before less that of the new one, (6,), when the mode changed, and that time: it fades out from then on."""
         self.wanted_w = ZERO
-        """(3,) velocity, world, m/s, at which this body would move if no other were in its way; only where it then stops before others."""
+        """(3,) velocity at which this body would move if no other were in its way, world, m/s; zero in modes that stop before none."""
         self.mode = Mode.POSHOLD
 
     def retune(self, parameters: Parameters) -> None:
@@ -229,6 +229,7 @@ class Guidance:
         if self.mode == Mode.AUTO and self._trajectory is not None and self._joined(self._trajectory, time_ns):
             sampled = self._sample(self._trajectory, time_ns)
             if sampled is not None:
+                self.wanted_w = sampled[0].v_w
                 return sampled
             self._trajectory = None  # it has a gap: the body stops before it
         if self.mode == Mode.DOCK and isinstance(self._docking, Setpoint):

@@ -204,3 +204,13 @@ def test_body_may_be_brought_before_a_face_and_leave_again() -> None:
         tank.run(8.0, Request(Action.HOLD, 0, Setpoint(np.array([x_m, 0.0, 0.8]), LEVEL, ZERO, ZERO, ZERO, ZERO)))
         assert tank.states[0][0] == pytest.approx(x_m, abs=0.01)
     assert not any("another body" in said for _, said in tank.event_log)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap_m", [0.1, 0.2])
+def test_body_at_rest_close_by_does_not_set_out_into_the_other(gap_m: float) -> None:
+    tank = two_in_the_water(Parameters())
+    tank.run(10.0, Request(Action.HOLD, 0, Setpoint(np.array([1.2 - EDGE_M - gap_m, 0.0, 0.8]), LEVEL, ZERO, ZERO, ZERO, ZERO)))
+    before = len(tank.past)
+    tank.run(5.0, Request(Action.HOLD, 0, Setpoint(np.array([2.4, 0.0, 0.8]), LEVEL, ZERO, ZERO, ZERO, ZERO)))
+    assert distances(tank)[before:].min() > EDGE_M + gap_m - 0.04

@@ -64,7 +64,7 @@ def test_matrix_of_faults_takes_the_others(flown: list[object], tmp_path: Path, 
 def test_interrupted_campaign_says_that_it_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(hil.campaign, "run_campaign", interrupt)
@@ -76,7 +76,7 @@ def test_campaign_that_is_terminated_from_elsewhere_says_that_it_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    monkeypatch.setattr(hil.campaign, "run_campaign", lambda *_: signal.raise_signal(signal.SIGTERM))
+    monkeypatch.setattr(hil.campaign, "run_campaign", lambda *_, **__: signal.raise_signal(signal.SIGTERM))
     try:
         assert status_of(["campaign", "hover", "--out", str(tmp_path)], monkeypatch) == INTERRUPTED
     finally:
