@@ -17,9 +17,9 @@ from firmware_py.core.rotations import V, to_matrix
 from firmware_py.core.types import Estimate
 
 M = "float64[:,::1]"
-CLOSING_M_S = 0.08
-"""Speed at which a module must itself move towards another to count as closing in. A hull bears a slower bump (docks touch at up to
-0.06), and a body may pass close by another slowly."""
+CLOSING_M_S, OWN_M_S = 0.08, 0.04
+"""Speed at which two modules must near each other to count, and the least part of it that must be a body's own, so that it can help. A hull
+bears a slower bump (docks touch at up to 0.06), and a body may pass close by another slowly."""
 
 
 def times_to_collision(
@@ -102,7 +102,8 @@ def _soonest(r_w, own_w, v_w, cylinder, of_body, ignored):  # type: ignore[no-un
             v_n, v_e, v_d = v_w[j, 0] - own_w[i, 0], v_w[j, 1] - own_w[i, 1], v_w[j, 2] - own_w[i, 2]
             own = north * own_w[i, 0] + east * own_w[i, 1] + down * own_w[i, 2]
             level_rate, down_rate, level2, down2 = north * v_n + east * v_e, down * v_d, north**2 + east**2, down**2
-            if level_rate + down_rate < 0.0 and own > CLOSING_M_S * math.sqrt(level2 + down2):  # not where it is NaN
+            distance = math.sqrt(level2 + down2)
+            if -level_rate - down_rate > CLOSING_M_S * distance and own > OWN_M_S * distance:  # not where it is NaN
                 radius_m, height_m = cylinder[i, 0] + cylinder[j, 0], cylinder[i, 1] + cylinder[j, 1]
                 beside = _within(level2 - radius_m**2, level_rate, v_n**2 + v_e**2)
                 above = _within(down2 - height_m**2, down_rate, v_d**2)

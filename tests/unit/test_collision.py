@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core.body import Body
-from firmware_py.core.collision import CLOSING_M_S, times_to_collision
+from firmware_py.core.collision import CLOSING_M_S, OWN_M_S, times_to_collision
 from firmware_py.core.rotations import from_euler, rotate_back
 from firmware_py.core.types import NEVER_AGE_NS, Action, Estimate, Mode, Request, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
@@ -93,8 +93,9 @@ def test_hull_above_another_has_its_height_for_a_reach() -> None:
         (at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0], ready=False)),
         (at([0.0, 0.0, 1.0], [0.2, math.nan, 0.0]), at([1.0, 0.0, 1.0])),
         (at([0.0, 0.0, 1.0], [0.99 * CLOSING_M_S, 0.0, 0.0]), at([0.25, 0.0, 1.0])),
+        (at([0.0, 0.0, 1.0], [0.21, 0.0, 0.0]), at([0.25, 0.0, 1.0], [0.2, 0.0, 0.0])),
     ],
-    ids=["they pass", "they part", "they fly abreast", "no tag seen", "no attitude", "no speed", "a slow bump"],
+    ids=["they pass", "they part", "they fly abreast", "no tag seen", "no attitude", "no speed", "a slow bump", "one follows"],
 )
 def test_bodies_that_do_not_close_in_have_no_time(first: Estimate, second: Estimate) -> None:
     assert np.isnan(pair(first, second)).all()
@@ -103,6 +104,12 @@ def test_bodies_that_do_not_close_in_have_no_time(first: Estimate, second: Estim
 def test_bodies_that_are_within_reach_and_still_close_in_have_no_time_left() -> None:
     assert pair(at([0.0, 0.0, 1.0], [0.1, 0.0, 0.0]), at([0.25, 0.0, 1.0]))[0] == 0.0
     assert math.isnan(pair(at([0.0, 0.0, 1.0], [-0.1, 0.0, 0.0]), at([0.25, 0.0, 1.0]))[0])
+
+
+def test_slow_bodies_that_meet_head_on_count_by_the_speed_of_both() -> None:
+    assert pair(at(ZERO, [0.05, 0.0, 0.0]), at([0.4, 0.0, 0.0], [-0.05, 0.0, 0.0])) == pytest.approx([(0.4 - TOUCH_M) / 0.1] * 2)
+    one, other = pair(at(ZERO, [0.99 * OWN_M_S, 0.0, 0.0]), at([0.4, 0.0, 0.0], [-0.2, 0.0, 0.0]))
+    assert math.isnan(one) and other > 0.0, "it cannot help much"
 
 
 def test_pair_that_docks_is_to_touch_and_a_third_body_is_not() -> None:
