@@ -86,7 +86,7 @@ class Formation:
         for pipeline in self.pipelines:
             pipeline.health.collision_s = times_s[pipeline.body.index]
 
-    def asked(self, pipeline: BodyPipeline, granted: Sequence[DockRequest]) -> list[DockRequest | PartRequest]:
+    def preparations_for(self, pipeline: BodyPipeline, granted: Sequence[DockRequest]) -> list[DockRequest | PartRequest]:
         """Preparations needed for the docks and undocks of a body that were granted in this tick."""
         if not pipeline.supervisor.armed:
             return [self._parting(pipeline, request) for request in granted]

@@ -24,7 +24,7 @@ from firmware_py.core.limiter import Limiter
 from firmware_py.core.measurements import Measurements
 from firmware_py.core.motor_test import MotorTest
 from firmware_py.core.paper_estimator import TagOnlyEstimator
-from firmware_py.core.requests import FOR_ALL, follow, sift
+from firmware_py.core.requests import FOR_ALL, readdressed, sift
 from firmware_py.core.sensor_watch import SensorWatch
 from firmware_py.core.supervisor import Decision, Supervisor
 from firmware_py.core.supply import SupplyMeter
@@ -72,7 +72,7 @@ class BodyPipeline:
         self.guidance = Guidance(body, parameters)
         self.motor_test = MotorTest(body, parameters.steering)
         self.dock_over = False
-        self._asked_ns, self._may = -ARMING_EVERY_NS, False
+        self._judged_ns, self._could_arm = -ARMING_EVERY_NS, False
         self.parting: list[DockRequest] = []
         """Open joints for which a plan was last requested."""
         self.controller = Controller(body, parameters.control)
@@ -164,21 +164,21 @@ class BodyPipeline:
         wrench = self.guidance.mix(wrench, time_ns, estimate, health)
         self.allocator.confine(self.limiter.limits(self.supply.voltage_v))
         thrust = self._allocate(wrench, time_ns)
-        armed, alive = self.supervisor.armed, self.faults.now.alive
-        force, command = self.limiter.step(thrust.force_n, armed, self.supply.voltage_v, alive)
+        supervisor = self.supervisor
+        force, command = self.limiter.step(thrust.force_n, supervisor.armed, self.supply.voltage_v, self.faults.now.alive)
         self.lag.command(force)
         self.health.warm = True
-        mode, may_arm = self.supervisor, self._may_arm(time_ns)
         record = BodyRecord(
-            self.body.index, mode.state, mode.mode, estimate, setpoint, wrench, thrust, force, may_arm, mode.level
-        )
+            self.body.index, supervisor.state, supervisor.mode, estimate, setpoint, wrench, thrust, force, self._may_arm(time_ns),
+            supervisor.level,
+        )  # fmt: skip
         return record, command
 
     def _may_arm(self, time_ns: int) -> bool:
         """Whether ARM would be granted. Evaluated ten times a second only, as it runs every check and is for display."""
-        if time_ns - self._asked_ns >= ARMING_EVERY_NS:
-            self._asked_ns, self._may = time_ns, self.supervisor.may_arm(self.health.now)
-        return self._may and self.supervisor.state == State.DISARMED
+        if time_ns - self._judged_ns >= ARMING_EVERY_NS:
+            self._judged_ns, self._could_arm = time_ns, self.supervisor.may_arm(self.health.now)
+        return self._could_arm and self.supervisor.state == State.DISARMED
 
     def magnets(self, wanted: Sequence[Sequence[int]], due: Collection[int]) -> dict[int, tuple[int, ...]]:
         """Limits the wanted relay states. Returns the states to send, by module: those of modules that are due or whose states changed.
@@ -234,13 +234,13 @@ class Pipeline:
         formation.step(inputs, estimates, outputs)
         formation.watch_distances(inputs.time_ns, estimates)
         bodies = {body.index: body for body in formation.bodies}
-        requests, refusals = sift(follow(inputs.requests, before, bodies), bodies)
+        requests, refusals = sift(readdressed(inputs.requests, before, bodies), bodies)
         outputs.events += refusals
         if requests:
             self._retune(requests, outputs)
         for pipeline in formation.pipelines:
             granted = pipeline.decide(inputs, estimates[pipeline.body.index], requests)
-            outputs.preparations += formation.asked(pipeline, granted)
+            outputs.preparations += formation.preparations_for(pipeline, granted)
             outputs.events += [event._replace(body=pipeline.body.index) for event in pipeline.supervisor.events]
             outputs.estop = outputs.estop or pipeline.supervisor.raises_estop
             if docking.under_way:

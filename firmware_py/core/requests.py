@@ -131,7 +131,7 @@ def sift(requests: Sequence[Request], bodies: Mapping[int, Body]) -> tuple[list[
     return sound, [Event(WARNING, f"{request.action.name} refused: {why}", request.body) for request, why in refused]
 
 
-def follow(requests: Sequence[Request], before: Sequence[Body], bodies: Mapping[int, Body]) -> list[Request]:
+def readdressed(requests: Sequence[Request], before: Sequence[Body], bodies: Mapping[int, Body]) -> list[Request]:
     """Readdresses requests whose body has joined or parted, in this tick or earlier: those that stop a body reach the modules it had.
 
     DISARM goes to every body that has a module of the body it named. A request that merely ends what a body does goes to the body that

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.core.requests import SOUND, against_request, follow, sift
+from firmware_py.core.requests import SOUND, against_request, readdressed, sift
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import State
@@ -157,23 +157,23 @@ def test_disarm_reaches_every_body_that_has_a_module_of_the_one_that_it_names() 
     other = single(2)
     apart, joined = [*APART.values(), other], [PAIR, other]
     requests = [Request(Action.DISARM, 0), Request(Action.ARM, 0), Request(Action.DISARM, 2)]
-    assert follow(requests, joined, {**APART, 2: other}) == [Request(Action.DISARM, 0), Request(Action.DISARM, 1), *requests[1:]]
-    assert follow([Request(Action.DISARM, 1)], apart, {0: PAIR, 2: other}) == [Request(Action.DISARM, 0)]
-    assert follow([Request(Action.DISARM, 7)], apart, {0: PAIR, 2: other}) == [Request(Action.DISARM, 7)], "which nobody is"
+    assert readdressed(requests, joined, {**APART, 2: other}) == [Request(Action.DISARM, 0), Request(Action.DISARM, 1), *requests[1:]]
+    assert readdressed([Request(Action.DISARM, 1)], apart, {0: PAIR, 2: other}) == [Request(Action.DISARM, 0)]
+    assert readdressed([Request(Action.DISARM, 7)], apart, {0: PAIR, 2: other}) == [Request(Action.DISARM, 7)], "which nobody is"
 
 
 @pytest.mark.parametrize("request_", ENDS_A_TASK, ids=action_of)
 def test_stop_for_a_number_that_leads_no_body_any_more_reaches_the_body_that_holds_its_module(request_: Request) -> None:
     """A person still sees two robots in the ticks after a join, and whoever sends 'disarm' must be obeyed."""
     joined = [PAIR, single(2)]
-    assert follow([request_], joined, {body.index: body for body in joined}) == [request_._replace(body=0)]
-    assert follow([request_], [*APART.values()], APART) == [request_], "there is such a body: it alone is meant"
+    assert readdressed([request_], joined, {body.index: body for body in joined}) == [request_._replace(body=0)]
+    assert readdressed([request_], [*APART.values()], APART) == [request_], "there is such a body: it alone is meant"
 
 
 @pytest.mark.parametrize("request_", BEGINS_A_TASK, ids=action_of)
 def test_task_for_a_number_that_leads_no_body_any_more_is_given_to_nobody(request_: Request) -> None:
     """It was meant for one module alone, at its own place."""
-    assert follow([request_], [PAIR], {0: PAIR}) == [request_]
+    assert readdressed([request_], [PAIR], {0: PAIR}) == [request_]
 
 
 # ---------------------------------------------------------------- in flight
