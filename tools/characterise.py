@@ -94,6 +94,9 @@ def arguments() -> argparse.Namespace:
         parser.error("--module tells of what an --assembly of AxBxC or of cells is made; give one with it")
     if (given.choose is None) != (given.task is None):
         parser.error("--choose N and --task FILE go together")
+    idle = [f"--{name}" for name in ("directions", "force", "torque", "jobs") if getattr(given, name) != parser.get_default(name)]
+    if given.choose is not None and idle:
+        parser.error(f"--choose takes no {', '.join(idle)}; leave out what does nothing")
     if not LEAST_DIRECTIONS <= given.directions <= MOST_DIRECTIONS:
         parser.error(f"--directions {given.directions}: permitted: {LEAST_DIRECTIONS} to {MOST_DIRECTIONS}")
     for option, size in (("--force", given.force), ("--torque", given.torque)):

@@ -177,7 +177,7 @@ def _waypoint(row: dict[str, str], path: str, line: int) -> WaypointTable:
     for key, names in (("position_m", _POSITION), ("quaternion", _ATTITUDE), ("velocity_m_s", _VELOCITY)):
         present = [n for n in names if (row.get(n) or "").strip()]
         if present and len(present) != len(names):
-            raise DescriptionError(f"{place}: give all of {', '.join(names)} or none")
+            raise DescriptionError(f"{place}: give all of {', '.join(names)}{'' if names is _POSITION else ' or none'}")
         if present:
             table[key] = [_number(row[n], n, place) for n in present]
     if (row.get("duration_s") or "").strip():
