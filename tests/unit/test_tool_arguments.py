@@ -72,7 +72,7 @@ def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys
         ("characterise", ["nosuch"], "characterise: vehicle 'nosuch' is unknown; there are "),
         ("characterise", ["modcube", "--force", "1e300"], "characterise: --force 1e+300: permitted: 1e-06 to 1e+06; see --help"),
         ("characterise", ["modcube", "--torque", "1e-300"], "characterise: --torque 1e-300: permitted: 1e-06 to 1e+06; see --help"),
-        ("characterise", ["--choose", "2", "--task", "t.toml", "--force", "2"], "characterise: --choose takes no --force; leave out what does"),
+        ("characterise", ["--choose", "2", "--task", "t.toml", "--force", "2"], "characterise: --choose takes no --force; leave out"),
         ("characterise", ["x" * 300], "characterise: vehicle 'xxx"),
         ("characterise", ["--assembly", "0,0,0 0,0,65"], "characterise: --assembly '0,0,0 0,0,65': needs AxBxC, cells such as "),
         ("bus_load", ["--dbc", str(TOOLS / "bus_load.py")], f"bus_load: {TOOLS / 'bus_load.py'}: is a file; a folder is needed"),
