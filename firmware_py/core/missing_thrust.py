@@ -55,8 +55,13 @@ CROSS_SHARE = 1.0 / 9.0
 """Mean square distance of the hull from a rotation axis, as a share of the body's squared reach: L^2 / 12 for a cube of edge L. A body
 that turns under way meets the water faster on one side than on the other; the drag's slope times this brakes the turn, which no model of
 the firmware includes. For a module that makes 0.20 N m per m/s and rad/s; tools/identify.py finds 0.14 to 0.21."""
-CORIOLIS, CROSSED, MUNK, FORCES = 15, 21, 24, 27
-"""First columns of a block's Coriolis wrench, speed across times rate, products of speeds, and forces; two more columns follow those."""
+RESIDUAL, ACTED, DOWN_B, CORIOLIS, CROSSED, MUNK = slice(6), slice(6, 12), slice(12, 15), slice(15, 21), slice(21, 24), slice(24, 27)
+"""Columns of a block, a row of means over its ticks: wrench residual, NaN unless the block is whole; wrench of the thrusters; down, body
+frame, at the block's end; Coriolis wrench; the two halves of FLOW."""
+FLOW = slice(CROSSED.start, MUNK.stop)
+"""Output of `add_flow`: speeds across times rates, products of speeds."""
+FORCES, TILT_SIGMA, SPEED = slice(MUNK.stop, -2), -2, -1
+"""The remaining columns: force of each thruster, sigma of the attitude, speed."""
 FRESH_NS = 500_000_000
 """Age of the newest tag at which judging stops: without tags, tilt and speed of a tumbling robot are known too poorly."""
 MOST = 2.6
@@ -102,7 +107,7 @@ class MissingThrust:
 
     def forget(self) -> None:
         """Drops all blocks and any suspicion, because the usable thrusters have changed. A trial goes on."""
-        self._blocks = np.full((GAP + BASE, FORCES + self._columns.shape[0] + 2), np.nan)
+        self._blocks = np.full((GAP + BASE, FORCES.start + self._columns.shape[0] + 2), np.nan)
         self._suspect, self._count = -1, 0
         self._start_block(None)
 
@@ -167,8 +172,9 @@ class MissingThrust:
             self._mean_residual = self._mean_residual + (residual - self._mean_residual) / self._whole
         down_b = rotate_back(estimate.q_wb, DOWN)
         self._blocks[:-1] = self._blocks[1:]
-        doubts = [max(estimate.sigma_q.tolist()), speed / n]
-        self._blocks[-1] = np.concatenate([residual, acted, down_b, coriolis / n, flow / n, forces / n, doubts])
+        now = self._blocks[-1]
+        now[RESIDUAL], now[ACTED], now[DOWN_B], now[CORIOLIS], now[FLOW] = residual, acted, down_b, coriolis / n, flow / n
+        now[FORCES], now[TILT_SIGMA], now[SPEED] = forces / n, max(estimate.sigma_q.tolist()), speed / n
         return whole
 
     def _decide(self, alive: np.ndarray) -> int | None:
@@ -189,16 +195,16 @@ class MissingThrust:
         """
         whole = ~np.isnan(self._blocks[:, 0])
         base, recent = (self._blocks[part][whole[part]].mean(axis=0) for part in (slice(BASE), slice(-RECENT, None)))
-        wall, column, sigma = (recent - base)[:6], self._columns[thruster], self._healthy[0]
-        liar, missed = [np.zeros(6)], (base - recent)[FORCES + thruster] * column
+        wall, column, sigma = (recent - base)[RESIDUAL], self._columns[thruster], self._healthy[0]
+        liar, missed = [np.zeros(6)], (base - recent)[FORCES][thruster] * column
         share = (missed / sigma) @ (wall / sigma) / max((missed / sigma) @ (missed / sigma), 1e-12)
         if self.parameters.lie_share <= share <= MOST:
-            liar.append(share * base[FORCES + thruster] * column)
-        return ThrusterTrial(thruster, base[:6], wall, liar, sigma)
+            liar.append(share * base[FORCES][thruster] * column)
+        return ThrusterTrial(thruster, base[RESIDUAL], wall, liar, sigma)
 
     def _judge_trial(self, full: bool) -> None:
         """Shows the latest block to the trial under way; a thruster may be acquitted so many times."""
-        verdict = None if self._trial is None else self._trial.is_innocent(self._blocks[-1, :6] if full else None)
+        verdict = None if self._trial is None else self._trial.is_innocent(self._blocks[-1, RESIDUAL] if full else None)
         if self._trial is None or verdict is None:
             return
         thruster, self._trial = self._trial.thruster, None
@@ -266,7 +272,7 @@ def add_tick(nu, q_wb, force_n, mass, righting, nodes, rotational, linear, model
 
 @njit(cache=True)
 def _mean_of_whole(blocks):  # type: ignore[no-untyped-def]
-    """Returns the mean (w,) over the whole blocks of (k, w), and their number; the wrench of the others is NaN."""
+    """Returns the mean (w,) over the whole blocks of (k, w), and their number; the residual of the others is NaN."""
     total, count = np.zeros(blocks.shape[1]), 0
     for k in range(blocks.shape[0]):
         if not math.isnan(blocks[k, 0]):
@@ -282,8 +288,7 @@ def explain(  # type: ignore[no-untyped-def]
     """Returns the one thruster that explains the change of the latest blocks against the oldest, or -1.
 
     Args:
-        blocks: (GAP + BASE, FORCES + n + 2) residual wrench 0:6, thruster wrench 6:12, down in the body 12:15, Coriolis wrench
-            15:21, output of `add_flow` 21:27, forces, sigma of the tilt, speed.
+        blocks: (GAP + BASE, w) blocks, the latest last; RESIDUAL and the names that follow it are their columns.
         columns: (n, 6) wrench of unit force. alive: (n,) thrusters that may be suspected.
         noise_sigma, sigma_per_tilt, sigma_per_speed: (6,) sigma of a healthy body's change: of noise; per radian of sigma of the tilt; per
             m/s of speed.
@@ -297,26 +302,27 @@ def explain(  # type: ignore[no-untyped-def]
     if base < LEAST_BASE or recent < RECENT - 1:
         return -1
     change = new - old
-    tx, ty, tz = change[12:CORIOLIS] ** 2
+    residual, acted, coriolis, crossed, munk = change[RESIDUAL], change[ACTED], change[CORIOLIS], change[CROSSED], change[MUNK]
+    tx, ty, tz = change[DOWN_B] ** 2
     lift, lx, ly, lz = buoyancy_sigma**2
     turned = (lift * tx, lift * ty, lift * tz, ly * tz + lz * ty, lz * tx + lx * tz, lx * ty + ly * tx)
-    speed = max(old[FORCES + n + 1], new[FORCES + n + 1])
+    speed = max(old[SPEED], new[SPEED])
     coriolis_share = MODEL_SHARE + DRIFT_M_S / max(speed, DRIFT_M_S)
     y, unsure, total = np.empty(6), np.empty(6), 0.0
     for i in range(6):
-        model = (MODEL_SHARE * change[6 + i]) ** 2 + (coriolis_share * change[CORIOLIS + i]) ** 2
+        model = (MODEL_SHARE * acted[i]) ** 2 + (coriolis_share * coriolis[i]) ** 2
         if i >= 3:
-            model += (flow_sigma[i - 3] * change[CROSSED + i - 3]) ** 2 + (flow_sigma[i] * change[MUNK + i - 3]) ** 2
-        of_tilt, of_speed = (sigma_per_tilt[i] * old[FORCES + n]) ** 2, (sigma_per_speed[i] * speed) ** 2
+            model += (flow_sigma[i - 3] * crossed[i - 3]) ** 2 + (flow_sigma[i] * munk[i - 3]) ** 2
+        of_tilt, of_speed = (sigma_per_tilt[i] * old[TILT_SIGMA]) ** 2, (sigma_per_speed[i] * speed) ** 2
         unsure[i] = math.sqrt(noise_sigma[i] ** 2 + model + turned[i] + of_tilt + of_speed)
-        y[i] = change[i] / unsure[i]
+        y[i] = residual[i] / unsure[i]
         total += y[i] ** 2
     if total < SIGNIFICANT:
         return -1
     best, least, second = -1, total, total
     for t in range(n):
         left = total
-        for force in (new[FORCES + t], change[FORCES + t]):  # lost since the base, or lost all along
+        for force in (new[FORCES][t], change[FORCES][t]):  # lost since the base, or lost all along
             size, fit = 0.0, 0.0
             for i in range(6):
                 phi = -columns[t, i] * force / unsure[i]

@@ -4,7 +4,21 @@ import numpy as np
 import pytest
 
 from firmware_py.core import propagation
-from firmware_py.core.missing_thrust import CORIOLIS, CROSSED, FORCES, MUNK, RECENT, MissingThrust, add_coriolis, add_flow, add_model
+from firmware_py.core.missing_thrust import (
+    ACTED,
+    CORIOLIS,
+    CROSSED,
+    FLOW,
+    FORCES,
+    MUNK,
+    RECENT,
+    RESIDUAL,
+    SPEED,
+    MissingThrust,
+    add_coriolis,
+    add_flow,
+    add_model,
+)
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import Estimate, Measured
@@ -130,16 +144,16 @@ def test_a_thruster_is_not_blamed_for_a_wall_that_the_robot_leans_on() -> None:
     rng, thrusters, blamed = np.random.default_rng(8), BODY.thrusters, 0
     for _ in range(300):
         watch = MissingThrust(BODY, Faults(), TICK_NS)
-        watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.05
-        watch._blocks[:, FORCES:-2] = PUSH
+        watch._blocks[:], watch._blocks[:, SPEED] = 0.0, 0.05
+        watch._blocks[:, FORCES] = PUSH
         axis, half = rng.integers(3), 0.105
         place, push = rng.uniform(-half, half, 3), rng.normal(0.0, 0.3, 3)
         place[axis], push[axis] = half, -1.0
         push *= rng.uniform(2.0, 10.0) / np.linalg.norm(push)
         wrench = np.r_[push, np.cross(place, push)]
-        watch._blocks[-RECENT:, :6] = wrench + 0.5 * watch._healthy[0] * rng.normal(size=6)
-        watch._blocks[-RECENT:, 6:12] = -wrench
-        watch._blocks[-RECENT:, FORCES:-2] -= thrusters.pinv @ wrench
+        watch._blocks[-RECENT:, RESIDUAL] = wrench + 0.5 * watch._healthy[0] * rng.normal(size=6)
+        watch._blocks[-RECENT:, ACTED] = -wrench
+        watch._blocks[-RECENT:, FORCES] -= thrusters.pinv @ wrench
         blamed += watch._explain(np.ones(8, bool)) >= 0
     assert blamed == 0
 
@@ -148,10 +162,10 @@ def test_a_thruster_that_lies_is_told_from_noise_of_the_size_that_is_foreseen() 
     rng, found = np.random.default_rng(9), 0
     for trial in range(200):
         watch = MissingThrust(BODY, Faults(), TICK_NS)
-        watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.05
+        watch._blocks[:], watch._blocks[:, SPEED] = 0.0, 0.05
         lost = -3.0 * BODY.thrusters.matrix[:, trial % 8]
-        watch._blocks[-RECENT:, :6] = lost + watch._healthy[0] * rng.normal(size=6)
-        watch._blocks[-RECENT:, FORCES + trial % 8] = 3.0
+        watch._blocks[-RECENT:, RESIDUAL] = lost + watch._healthy[0] * rng.normal(size=6)
+        watch._blocks[-RECENT:, FORCES][:, trial % 8] = 3.0
         found += watch._explain(np.ones(8, bool)) == trial % 8
     assert found >= 170, "nine of ten"
 
@@ -160,22 +174,22 @@ def test_a_thruster_that_lies_is_told_from_noise_of_the_size_that_is_foreseen() 
 def test_a_thruster_is_not_blamed_for_a_change_that_is_small_beside_the_coriolis_wrench(coriolis: float) -> None:
     """Masses are known to a tenth, the speed through drifting water less well, and the Coriolis wrench of a fast curve no better."""
     watch = MissingThrust(BODY, Faults(), TICK_NS)
-    watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.3
+    watch._blocks[:], watch._blocks[:, SPEED] = 0.0, 0.3
     lost = -3.0 * BODY.thrusters.matrix[:, 2]
-    watch._blocks[-RECENT:, :6], watch._blocks[-RECENT:, FORCES + 2] = lost, 3.0
-    watch._blocks[-RECENT:, CORIOLIS:CROSSED] = coriolis * lost
+    watch._blocks[-RECENT:, RESIDUAL], watch._blocks[-RECENT:, FORCES][:, 2] = lost, 3.0
+    watch._blocks[-RECENT:, CORIOLIS] = coriolis * lost
     assert watch._explain(np.ones(8, bool)) == (-1 if coriolis == 10.0 else 2)
 
 
 @pytest.mark.parametrize(("column", "most"), [(CROSSED, 0.5), (MUNK, 0.2)])
 @pytest.mark.parametrize("sign", [-1.0, 0.0, 1.0])
-def test_a_thruster_is_not_blamed_for_what_the_water_does_to_a_body_that_turns_under_way(column: int, most: float, sign: float) -> None:
+def test_a_thruster_is_not_blamed_for_what_the_water_does_to_a_body_that_turns_under_way(column: slice, most: float, sign: float) -> None:
     """Flow across the turn brakes it, and masses that differ between axes turn the body: neither is in the model of a cube."""
     watch = MissingThrust(BODY, Faults(), TICK_NS)
-    watch._blocks[:], watch._blocks[:, -1] = 0.0, 0.3
-    watch._blocks[-RECENT:, :6] = -2.0 * BODY.thrusters.matrix[:, 2]
-    watch._blocks[-RECENT:, FORCES + 2] = 2.0
-    watch._blocks[-RECENT:, column : column + 3] = sign * most
+    watch._blocks[:], watch._blocks[:, SPEED] = 0.0, 0.3
+    watch._blocks[-RECENT:, RESIDUAL] = -2.0 * BODY.thrusters.matrix[:, 2]
+    watch._blocks[-RECENT:, FORCES][:, 2] = 2.0
+    watch._blocks[-RECENT:, column] = sign * most
     assert watch._explain(np.ones(8, bool)) == (2 if sign == 0.0 else -1)
 
 
@@ -188,7 +202,7 @@ def test_flow_is_what_a_turn_under_way_meets_and_every_block_has_it() -> None:
     )  # fmt: skip
     for _ in range(10):
         watch.step(Measured(nu[3:], np.zeros(3), None, []), estimate, np.zeros(8), np.ones(8, bool), True, True)
-    np.testing.assert_allclose(watch._blocks[-1, CROSSED:FORCES], out)
+    np.testing.assert_allclose(watch._blocks[-1, FLOW], out)
 
 
 @pytest.mark.parametrize("ready", [True, False])
@@ -204,4 +218,4 @@ def test_block_in_which_the_pose_was_lost_is_not_judged(ready: bool) -> None:
         if tick % 10 == 9:
             judged.append(not np.isnan(watch._blocks[-1, 0]))
     assert judged == [True, True, ready, ready, ready, True]
-    assert np.nanmax(np.abs(watch._blocks[-6:, 5])) < (0.2 if ready else 0.01)
+    assert np.nanmax(np.abs(watch._blocks[-6:, RESIDUAL][:, 5])) < (0.2 if ready else 0.01)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_py.core.faults import FaultDetector
-from firmware_py.core.missing_thrust import FORCES, RECENT, MissingThrust
+from firmware_py.core.missing_thrust import FORCES, RECENT, RESIDUAL, MissingThrust
 from firmware_py.core.thruster_trial import JUDGED, PATIENCE, SETTLE, ThrusterTrial
 from firmware_py.description.failsafe_parameters import Faults
 from tests.unit.robot_in_water import BODY, PUSH, TICK_NS, Water
@@ -151,7 +151,7 @@ def test_thruster_is_acquitted_where_it_never_pushed_hard_enough_to_be_missed_so
     watch = MissingThrust(BODY, Faults(), TICK_NS)
     watch._blocks[:] = 0.0
     wall = 3.0 * BODY.thrusters.matrix[:, 4]
-    watch._blocks[-RECENT:, :6] = wall
-    watch._blocks[:-RECENT, FORCES + 4] = 0.3
+    watch._blocks[-RECENT:, RESIDUAL] = wall
+    watch._blocks[:-RECENT, FORCES][:, 4] = 0.3
     trial = watch._accuse(4)
     assert [trial.is_innocent(wall) for _ in range(SETTLE + JUDGED)][-1] is True
