@@ -281,6 +281,50 @@ def _mean_of_whole(blocks):  # type: ignore[no-untyped-def]
     return total / max(count, 1), count
 
 
+@njit(cache=True)
+def _sigma_of_change(  # type: ignore[no-untyped-def]
+    change, tilt_sigma, speed, noise_sigma, buoyancy_sigma, sigma_per_tilt, sigma_per_speed, flow_sigma
+):
+    """Returns the sigma (6,) of the change of a healthy body's residual; see `explain` for the last five arguments.
+
+    Args:
+        change: (w,) change of a block. tilt_sigma: of the tilt, rad. speed: m/s.
+    """
+    acted, coriolis, crossed, munk = change[ACTED], change[CORIOLIS], change[CROSSED], change[MUNK]
+    tx, ty, tz = change[DOWN_B] ** 2
+    lift, lx, ly, lz = buoyancy_sigma**2
+    turned = (lift * tx, lift * ty, lift * tz, ly * tz + lz * ty, lz * tx + lx * tz, lx * ty + ly * tx)
+    coriolis_share = MODEL_SHARE + DRIFT_M_S / max(speed, DRIFT_M_S)
+    sigma = np.empty(6)
+    for i in range(6):
+        model = (MODEL_SHARE * acted[i]) ** 2 + (coriolis_share * coriolis[i]) ** 2
+        if i >= 3:
+            model += (flow_sigma[i - 3] * crossed[i - 3]) ** 2 + (flow_sigma[i] * munk[i - 3]) ** 2
+        of_tilt, of_speed = (sigma_per_tilt[i] * tilt_sigma) ** 2, (sigma_per_speed[i] * speed) ** 2
+        sigma[i] = math.sqrt(noise_sigma[i] ** 2 + model + turned[i] + of_tilt + of_speed)
+    return sigma
+
+
+@njit(cache=True)
+def _left_by(column, lost_since, lost_all_along, y, sigma, total, lie_share):  # type: ignore[no-untyped-def]
+    """Returns what a liar leaves unexplained of the change `y` (6,), which is in sigmas and squared makes `total`; `total` for no liar.
+
+    Args:
+        column: (6,) wrench of its unit force. lost_since, lost_all_along: forces that it lacks if it lost them since the base, or before.
+    """
+    left = total
+    for force in (lost_since, lost_all_along):
+        size, fit = 0.0, 0.0
+        for i in range(6):
+            phi = -column[i] * force / sigma[i]
+            size += phi * phi
+            fit += phi * y[i]
+        share = fit / max(size, 1e-12)
+        if lie_share <= share <= MOST and size >= 1.0:
+            left = min(left, total - share * fit)
+    return left
+
+
 @njit(f"int64({M},{M},boolean[::1],{V},{V},{V},{V},{V},float64)", cache=True)
 def explain(  # type: ignore[no-untyped-def]
     blocks, columns, alive, noise_sigma, buoyancy_sigma, sigma_per_tilt, sigma_per_speed, flow_sigma, lie_share
@@ -296,41 +340,22 @@ def explain(  # type: ignore[no-untyped-def]
         buoyancy_sigma: (4,) sigma of net buoyancy, N, and of weight times the lever of buoyancy along each axis, N m.
         lie_share: smallest share of its force that a liar has lost.
     """
-    n = columns.shape[0]
     old, base = _mean_of_whole(blocks[:BASE])
     new, recent = _mean_of_whole(blocks[-RECENT:])
     if base < LEAST_BASE or recent < RECENT - 1:
         return -1
-    change = new - old
-    residual, acted, coriolis, crossed, munk = change[RESIDUAL], change[ACTED], change[CORIOLIS], change[CROSSED], change[MUNK]
-    tx, ty, tz = change[DOWN_B] ** 2
-    lift, lx, ly, lz = buoyancy_sigma**2
-    turned = (lift * tx, lift * ty, lift * tz, ly * tz + lz * ty, lz * tx + lx * tz, lx * ty + ly * tx)
-    speed = max(old[SPEED], new[SPEED])
-    coriolis_share = MODEL_SHARE + DRIFT_M_S / max(speed, DRIFT_M_S)
-    y, unsure, total = np.empty(6), np.empty(6), 0.0
+    change, speed = new - old, max(old[SPEED], new[SPEED])
+    sigma = _sigma_of_change(change, old[TILT_SIGMA], speed, noise_sigma, buoyancy_sigma, sigma_per_tilt, sigma_per_speed, flow_sigma)
+    y, total = change[RESIDUAL] / sigma, 0.0
     for i in range(6):
-        model = (MODEL_SHARE * acted[i]) ** 2 + (coriolis_share * coriolis[i]) ** 2
-        if i >= 3:
-            model += (flow_sigma[i - 3] * crossed[i - 3]) ** 2 + (flow_sigma[i] * munk[i - 3]) ** 2
-        of_tilt, of_speed = (sigma_per_tilt[i] * old[TILT_SIGMA]) ** 2, (sigma_per_speed[i] * speed) ** 2
-        unsure[i] = math.sqrt(noise_sigma[i] ** 2 + model + turned[i] + of_tilt + of_speed)
-        y[i] = residual[i] / unsure[i]
         total += y[i] ** 2
     if total < SIGNIFICANT:
         return -1
     best, least, second = -1, total, total
-    for t in range(n):
-        left = total
-        for force in (new[FORCES][t], change[FORCES][t]):  # lost since the base, or lost all along
-            size, fit = 0.0, 0.0
-            for i in range(6):
-                phi = -columns[t, i] * force / unsure[i]
-                size += phi * phi
-                fit += phi * y[i]
-            share = fit / max(size, 1e-12)
-            if alive[t] and lie_share <= share <= MOST and size >= 1.0:
-                left = min(left, total - share * fit)
+    for t in range(alive.size):
+        if not alive[t]:
+            continue
+        left = _left_by(columns[t], new[FORCES][t], change[FORCES][t], y, sigma, total, lie_share)
         if left < least:
             best, least, second = t, left, least
         else:
