@@ -10,7 +10,7 @@ import numpy as np
 from google.protobuf.message import DecodeError
 
 from firmware_py.bus.codec import Codec
-from firmware_py.runtime.flight_log import LoggedTick, shown
+from firmware_py.runtime.flight_log import LoggedTick, parts_of, shown
 from firmware_py.runtime.tick_messages import Message
 
 SMALL = 1e-3
@@ -83,7 +83,7 @@ class Comparison:
         return bool(was == now)
 
     def _in_frame(self, was: str, now: str) -> Found | None:
-        (where, number, before), (there, other, after) = _frame_of(was), _frame_of(now)
+        (where, number, before), (there, other, after) = _parts_of(was), _parts_of(now)
         message = self._codec.by_id(number)
         if (where, number, len(before)) != (there, other, len(after)) or message is None:
             return "frame", shown(was) if was else "nothing", shown(now) if now else "nothing"
@@ -97,11 +97,9 @@ def _words(value: Any) -> str:
     return shown(value) if isinstance(value, str) else str(value)
 
 
-def _frame_of(line: str) -> tuple[str, int, bytes]:
+def _parts_of(line: str) -> tuple[str, int, bytes]:
     """Channel, id and data of a line of can.log; for a line that is no frame, the id -1."""
     try:
-        _, channel, frame, _ = line.split(" ")
-        number, _, data = frame.partition("#")
-        return channel, int(number, 16), bytes.fromhex(data)
+        return parts_of(line)
     except ValueError:
         return "", -1, b""

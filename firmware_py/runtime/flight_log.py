@@ -39,13 +39,19 @@ def shown(text: str) -> str:
     return quoted if len(quoted) <= SHOWN_CHARACTERS else f"{quoted[: SHOWN_CHARACTERS - 3]}..."
 
 
-def frame_of(line: str) -> LoggedFrame:
-    """The frame of a line of can.log. Raises ValueError where it holds none."""
+def parts_of(line: str) -> tuple[str, int, bytes]:
+    """Channel, id and data of a line of can.log. Raises ValueError where it is not of that form."""
     _, channel, frame, _ = line.split(" ")
     number, _, data = frame.partition("#")
-    logged = LoggedFrame(int(channel[3:]), int(number, 16), bytes.fromhex(data))
+    return channel, int(number, 16), bytes.fromhex(data)
+
+
+def frame_of(line: str) -> LoggedFrame:
+    """The frame of a line of can.log. Raises ValueError where it holds none that a bus could carry."""
+    channel, number, data = parts_of(line)
+    logged = LoggedFrame(int(channel[3:]), number, data)
     if logged.bus < 0 or not 0 <= logged.id <= HIGHEST_ID or len(logged.data) > LONGEST_DATA:
-        raise ValueError(f"{channel} {frame} is no frame of a bus")
+        raise ValueError(f"{line.strip()} is no frame of a bus")
     return logged
 
 
