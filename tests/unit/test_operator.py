@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from firmware_py.app.vehicle_process import ARM_EVERY_S, FAREWELL_TICKS, REARM_S, Operator, with_ground
+from firmware_py.app.operator import ARM_EVERY_S, FAREWELL_TICKS, REARM_S, Operator, with_ground
 from firmware_py.core.transitions import State
 from firmware_py.core.types import NEVER_AGE_NS, Action, BodyRecord, Mode, Outputs, Request
 from tests.unit.ground_world import Robot

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from firmware_py.app import vehicle_process
-from firmware_py.app.vehicle_process import Operator
+from firmware_py.app.operator import Operator
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters, Supervision
 from firmware_py.runtime.clock import boot_id
