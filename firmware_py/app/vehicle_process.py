@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from firmware_py.app.configuration import configuration_of
 from firmware_py.app.deadlines import Summary, recording_times, summary_of
@@ -18,7 +18,6 @@ from firmware_py.app.observers import Observer, recording, recording_buses, tell
 from firmware_py.app.operator import REARM_S, Operator, with_ground
 from firmware_py.app.realtime import RealTimeLoop, open_loop
 from firmware_py.app.service import reporting
-from firmware_py.core.types import Outputs, Request
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
@@ -75,7 +74,8 @@ def run_vehicle(
     laid = with_stored_values(parameters, store)
     release_compiler()
     with ExitStack() as stack:
-        teller = Teller(say)  # before this thread takes its priority, like every thread below that does not belong to the loop
+        # Threads that do not belong to the loop start before this thread takes its priority, which they would inherit.
+        teller = Teller(say)
         stack.callback(teller.close)
         move_to_own_processor = stack.enter_context(beside_the_tick())
         worker = ThreadWorker()
@@ -88,46 +88,89 @@ def run_vehicle(
         operator = Operator(fleet.rate_hz, to_arm(before, firmware, hold, teller.say), math.inf if hold else REARM_S, teller.say)
         if hold and out is None:
             teller.say(FORGETFUL)
-        for body in firmware.pipeline.bodies:
-            if not body.tag_ids.size:
-                teller.say(UNTAGGED.format(" and ".join(map(fleet.label, body.modules))))
-        stack.enter_context(handled(operator.stop, endings_of_a_run()))  # until the log and the e-stop note below are closed
-        note = _open_note(stack, out) if out is not None else None  # before the log: of two processes started at once, one gets the folder
-        notes = {"boot": boot, "apart": sorted(before.apart(firmware))}
-        recorder = _open_recorder(stack, configuration_of(firmware, rate_hz=fleet.rate_hz, **notes), firmware, out, live, teller.say)
-        observers = list(_recording_observers(firmware, recorder, note, live, before.stopped))
-        told: list[Observer] = [telling(teller.say)]  # called after all other observers, which may add events
-        requests: Callable[[int, Outputs | None], list[Request]] = operator.requests
-        side: GroundSide | None = None
-        if ground is not None:
-            from firmware_py.app.ground_station import GroundSide  # costs a tenth of a second, and 6 MB of message classes
-
-            # As with the recorder and the live view, its threads start before this thread takes its priority, which they would inherit.
-            side = stack.enter_context(GroundSide(ground, firmware, priority=GROUND_PRIORITY, started=parameters))
-            told.append(side.observe)
-            requests = with_ground(operator, side, lambda: firmware.pipeline.bodies)
-        read_libraries()
-        for line in stack.enter_context(real_time()):
-            teller.say(f"warning: {line}")
-        loop = open_loop(stack, firmware, requests)
-        buses = watching_buses(loop.ports, fleet.rate_hz)
-        loop.observers = [*observers, *_timing_observers(loop, fleet.rate_hz, recorder, side, notifier), buses, *told]
+        _warn_of_untagged(firmware, teller.say)
+        stack.enter_context(handled(operator.stop, endings_of_a_run()))  # until the log and the e-stop note are closed
+        logs = _open_logs(stack, firmware, before, boot, out, live, teller.say)
+        side = _open_ground(stack, ground, firmware, parameters) if ground is not None else None
+        loop = _prepare_loop(stack, firmware, operator, side, teller.say)
+        loop.observers = _observers(loop, logs, side, notifier, teller.say)
         use_priority(TICK_PRIORITY)
         move_to_own_processor()
         loop.listen()
         if out is not None and estop_stands(out) and not before.stopped:
             raise DescriptionError(f"{out}: an e-stop was raised while this process started, by one that ran until then; start it again")
-        if operator.stopping:  # asked before the first tick
-            return summary_of(loop)
-        stack.enter_context(quiet_garbage())
-        teller.say(f"messages count modules from 0: {', '.join(f'{k} is number {fleet.label(k)}' for k in range(len(fleet.module)))}")
-        teller.say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
-        if notifier is not None:
-            stack.callback(notifier.send, "STOPPING=1")  # the first of what ends: now TimeoutStopSec counts, and no longer the watchdog
-        loop.run(operator.is_done)
-        if recorder is not None and loop.last is not None:
-            recorder.record_times(loop.last.tick, loop.last.time_ns, loop.rate_keeper)
+        if not operator.stopping:  # else asked before the first tick
+            _run_loop(stack, loop, operator, logs.recorder, notifier, teller.say)
         return summary_of(loop)
+
+
+class _Logs(NamedTuple):
+    """What a run leaves behind."""
+
+    recorder: Recorder | None
+    observers: list[Observer]
+    """They write the log and the e-stop note, and serve the live view."""
+
+
+def _warn_of_untagged(firmware: Firmware, say: Callable[[str], None]) -> None:
+    for body in firmware.pipeline.bodies:
+        if not body.tag_ids.size:
+            say(UNTAGGED.format(" and ".join(map(firmware.fleet.label, body.modules))))
+
+
+def _open_logs(
+    stack: ExitStack, firmware: Firmware, before: LastFlight, boot: str, out: Path | None, live: LiveView | None,
+    say: Callable[[str], None],
+) -> _Logs:  # fmt: skip
+    """The e-stop note and the recorder, which `stack` closes. Raises DescriptionError where another process writes into `out`."""
+    note = _open_note(stack, out) if out is not None else None  # before the log: of two processes started at once, one gets the folder
+    configuration = configuration_of(firmware, rate_hz=firmware.fleet.rate_hz, boot=boot, apart=sorted(before.apart(firmware)))
+    recorder = _open_recorder(stack, configuration, firmware, out, live, say)
+    return _Logs(recorder, list(_recording_observers(firmware, recorder, note, live, before.stopped)))
+
+
+def _open_ground(stack: ExitStack, ground: GroundConfig, firmware: Firmware, started: Parameters) -> GroundSide:
+    """The links to ground stations, which `stack` closes; `started`: the parameters without those that ground stations stored."""
+    from firmware_py.app.ground_station import GroundSide  # costs a tenth of a second, and 6 MB of message classes
+
+    return stack.enter_context(GroundSide(ground, firmware, priority=GROUND_PRIORITY, started=started))
+
+
+def _prepare_loop(
+    stack: ExitStack, firmware: Firmware, operator: Operator, side: GroundSide | None, say: Callable[[str], None]
+) -> RealTimeLoop:
+    """The loop, in a process set up for real time until `stack` ends. Raises PortError."""
+    requests = operator.requests if side is None else with_ground(operator, side, lambda: firmware.pipeline.bodies)
+    read_libraries()
+    for line in stack.enter_context(real_time()):
+        say(f"warning: {line}")
+    return open_loop(stack, firmware, requests)
+
+
+def _observers(
+    loop: RealTimeLoop, logs: _Logs, side: GroundSide | None, notifier: Notifier | None, say: Callable[[str], None]
+) -> list[Observer]:
+    """All observers of the loop. Those that pass events on come last, because the others may add some."""
+    rate_hz = loop.firmware.fleet.rate_hz
+    buses = watching_buses(loop.ports, rate_hz)
+    told = [telling(say)] if side is None else [telling(say), side.observe]
+    return [*logs.observers, *_timing_observers(loop, rate_hz, logs.recorder, side, notifier), buses, *told]
+
+
+def _run_loop(
+    stack: ExitStack, loop: RealTimeLoop, operator: Operator, recorder: Recorder | None, notifier: Notifier | None,
+    say: Callable[[str], None],
+) -> None:  # fmt: skip
+    """Runs the loop until the operator has said farewell."""
+    fleet = loop.firmware.fleet
+    stack.enter_context(quiet_garbage())
+    say(f"messages count modules from 0: {', '.join(f'{k} is number {fleet.label(k)}' for k in range(len(fleet.module)))}")
+    say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
+    if notifier is not None:
+        stack.callback(notifier.send, "STOPPING=1")  # the first of what ends: now TimeoutStopSec counts, and no longer the watchdog
+    loop.run(operator.is_done)
+    if recorder is not None and loop.last is not None:
+        recorder.record_times(loop.last.tick, loop.last.time_ns, loop.rate_keeper)
 
 
 def _open_note(stack: ExitStack, out: Path) -> EstopNote:
