@@ -28,6 +28,7 @@ from hil.force_script import ForceScript
 from hil.mode_script import ModeScript
 from hil.nodes import Nodes, make_nodes
 from hil.orders import Orders
+from hil.plant.world import World
 from hil.scenario import Scenario, make_world
 from hil.script import Script
 from hil.truth_log import TruthRecorder
@@ -36,6 +37,8 @@ LOOK_S = 0.005
 """Polling period while listening to a bus: SYNC comes at 50 Hz at least."""
 SCRIPTS: dict[str, Callable[[Scenario, Fleet], Orders]] = {"dock": DockScript, "force": ForceScript, "mode": ModeScript}
 """Orders by kind of task; the remaining kinds, which are trajectories, use Script."""
+WorldWatch = Callable[[int, World], None]
+"""Called in each tick with its number and the world."""
 
 
 @dataclass(slots=True)
@@ -55,9 +58,9 @@ class Bench:
 
     @quiet_garbage()
     def fly(
-        self, observers: Sequence[Observer] = (), progress: Callable[[float], None] | None = None, truth: TruthRecorder | None = None
+        self, observers: Sequence[Observer] = (), progress: Callable[[float], None] | None = None, watch: WorldWatch | None = None
     ) -> float:
-        """Flies to the end of the script; returns the wall time that took, s.
+        """Flies to the end of the script; returns the wall time that took, s. Calls `watch` once the plant has done its half of a tick.
 
         Raises DescriptionError if another node answers as one of the simulated modules.
         """
@@ -68,12 +71,12 @@ class Bench:
         for tick in range(1, self.script.ticks + 1):
             time_ns = tick * fleet.period_ns
             if self.faults.process_killed(time_ns):
-                self._step_plant(tick, sent, truth)
+                self._step_plant(tick, sent, watch)
                 lockstep, outputs, sent = self._without_firmware(observers), None, []
                 continue
             self.is_dead = False
             sent += lockstep.start_tick(tick, time_ns)
-            answers = self._step_plant(tick, sent, truth)
+            answers = self._step_plant(tick, sent, watch)
             outputs, sent = lockstep.finish_tick(tick, time_ns, self.script.requests(time_ns, outputs), answers)
             if self.script.is_over(time_ns):
                 break
@@ -95,14 +98,14 @@ class Bench:
                 raise PortError(OTHER_SYNC)
             time.sleep(LOOK_S)
 
-    def _step_plant(self, tick: int, sent: Sequence[BusFrame], truth: TruthRecorder | None) -> list[BusFrame]:
+    def _step_plant(self, tick: int, sent: Sequence[BusFrame], watch: WorldWatch | None) -> list[BusFrame]:
         """The plant's half of a tick: takes the sent frames, advances by a period and answers; returns the answers."""
         heard = [frame for _, frame in drain([self.plant_port], sent, self.patience_looks)]
         if tick <= self.firmware.fleet.rate_hz:  # later, this bench was there first
             self.nodes.refuse_others(heard, self.plant_port.address)
         answers = send([self.plant_port], [(0, frame) for frame in self.nodes.step(heard)])
-        if truth is not None:
-            truth.record_world(tick, self.nodes.world)
+        if watch is not None:
+            watch(tick, self.nodes.world)
         return answers
 
     def _without_firmware(self, observers: Sequence[Observer]) -> Lockstep:
@@ -164,7 +167,7 @@ def fly_scenario(
         stack.callback(recorder.close)
         thrusters = tuple(len(v.thruster) for v in bench.nodes.world.vehicles)
         truth = stack.enter_context(TruthRecorder(out, thrusters))
-        wall_s = bench.fly([recording(recorder, rate_hz), lambda *_: check()], progress, truth)
+        wall_s = bench.fly([recording(recorder, rate_hz), lambda *_: check()], progress, truth.record_world)
         recorder.close()
         recorder.check()
         return wall_s

@@ -12,7 +12,7 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from hil.metrics import Poses, errors, flight_metrics, rms
 from hil.orders import Orders
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
+from hil.plant.world import World
 from hil.scenario import MODES, Scenario, load_scenario
 from hil.signals import Flight
 
@@ -167,16 +168,13 @@ def command_outlives_frames_ms() -> float:
         bench = open_bench(stack, scenario, 0, Parameters(), "virtual:lost")
         mcu = next(iter(bench.nodes.mcus.values()))
 
-        class Watch:
-            """Stands in for the truth recorder to look at the MCU once a tick."""
+        def watch(tick: int, world: World) -> None:
+            nonlocal longest
+            accepted = [at_ns for at_ns in mcu.accepted_ns if at_ns is not None]
+            if accepted and any(mcu.applied):
+                longest = max(longest, (world.time_ns - max(accepted)) * 1e-6)
 
-            def record_world(self, tick: int, world: Any) -> None:
-                nonlocal longest
-                accepted = [at_ns for at_ns in mcu.accepted_ns if at_ns is not None]
-                if accepted and any(mcu.applied):
-                    longest = max(longest, (world.time_ns - max(accepted)) * 1e-6)
-
-        bench.fly(truth=Watch())  # type: ignore[arg-type]
+        bench.fly(watch=watch)
         return float("inf") if any(mcu.applied) else longest
 
 
