@@ -116,8 +116,8 @@ class Bench:
         return Lockstep(self.firmware, [self.firmware_port], observers, self.patience_looks)
 
 
-def fleet_of(scenario: Scenario, bus: str, rate_hz: int) -> Fleet:
-    """The fleet that a scenario's modules make up, all on one bus."""
+def fleet_of(scenario: Scenario, bus: str = DEFAULT_BUS, rate_hz: int = 100) -> Fleet:
+    """The fleet that a scenario's modules make up, all on one bus. Paths and bodies depend on neither bus nor rate."""
     modules = tuple(
         Module(number=m.number, vehicle=m.vehicle, body=m.body, cell=m.cell, rotation=m.rotation) for m in scenario.module
     )

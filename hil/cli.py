@@ -72,7 +72,7 @@ def scenario_of(name: str, vehicle: str, sensors: str) -> Scenario:
         raise DescriptionError(f"sensors {sensors!r} is unknown; there are real, ideal")
     if sensors == "ideal":
         scenario = scenario.with_ideal_sensors()
-    if name.endswith(".toml") and (mistake := mistake_of_flight(scenario, fleet_of(scenario, DEFAULT_BUS, 100))):
+    if name.endswith(".toml") and (mistake := mistake_of_flight(scenario, fleet_of(scenario))):
         raise _source_of(name).error(*mistake)
     return scenario
 

@@ -196,7 +196,7 @@ def passive_in(scenario: Scenario) -> tuple[int, ...]:
     vehicles = {module.vehicle: load_vehicle(module.vehicle) for module in scenario.module}
     if not any(vehicle.passive_dof for vehicle in vehicles.values()):
         return ()
-    fleet = fleet_of(scenario, DEFAULT_BUS, 100)
+    fleet = fleet_of(scenario)
     return passive_axes(fleet, groups_of(fleet)[0], vehicles)
 
 
@@ -204,7 +204,7 @@ def wanted_in(scenario: Scenario, flight: Flight, begin_ns: int) -> Poses | None
     """Reference poses of the task, begun at `begin_ns`, in every tick of `flight`; None if the task is not a path."""
     if scenario.task.kind in SCRIPTS:
         return None
-    path = Script(scenario, fleet_of(scenario, DEFAULT_BUS, 100)).trajectory
+    path = Script(scenario, fleet_of(scenario)).trajectory
     poses = [path.sample(time_ns * 1e-9) for time_ns in (flight.firmware["time_ns"] - begin_ns).tolist()]
     return Poses(np.array([pose.p_wb for pose in poses]).reshape(-1, 3), np.array([pose.q_wb for pose in poses]).reshape(-1, 4))
 
