@@ -117,27 +117,16 @@ def fly_in_real_time(
         if before_logs is not None:
             before_logs()
         recorder = _recorder(stack, out, firmware, scenario.name, seed, rate_hz)
-
-        def stop_at_end(tick: int, outputs: Outputs) -> bool:
-            if tick % rate_hz == 0:
-                if not plant.is_alive():
-                    raise DescriptionError("the plant's process has ended, and the flight with it")
-                if progress is not None:
-                    progress(tick / rate_hz)
-            return orders.are_over(tick, outputs.time_ns)
-
         refused = stack.enter_context(real_time())
         loop = open_loop(stack, firmware, orders.requests)
-        times = recording_times(recorder, loop.rate_keeper, rate_hz)
-        buses = recording_buses(recorder, loop.ports, rate_hz)
-        loop.observers = [recording(recorder, rate_hz), times, buses, lambda *_: check(), *observers]
+        loop.observers = [*_recording_observers(recorder, loop, rate_hz), lambda *_: check(), *observers]
         use_priority(TICK_PRIORITY)
         stack.enter_context(quiet_garbage())
         handshake.begin.set()
         loop.listen()
         orders.start_ns = loop.clock.now_ns()
         loop.rate_keeper.start(orders.start_ns + fleet.period_ns)
-        loop.run(stop_at_end)
+        loop.run(_stop_at_end(orders, plant, rate_hz, progress))
     return _flown(loop, rate_hz, refused)
 
 
@@ -171,6 +160,29 @@ def _recorder(stack: ExitStack, out: Path, firmware: Firmware, scenario: str, se
     for body in firmware.pipeline.bodies:
         recorder.expect(body.index, body.thrusters.f_max.size)
     return recorder
+
+
+def _recording_observers(recorder: Recorder, loop: RealTimeLoop, rate_hz: int) -> list[Observer]:
+    """Observers that record the ticks, their timing and the ports' faults."""
+    times = recording_times(recorder, loop.rate_keeper, rate_hz)
+    buses = recording_buses(recorder, loop.ports, rate_hz)
+    return [recording(recorder, rate_hz), times, buses]
+
+
+def _stop_at_end(
+    orders: _Started, plant: BaseProcess, rate_hz: int, progress: Callable[[float], None] | None
+) -> Callable[[int, Outputs], bool]:
+    """The function that ends a loop with its orders. Once a second it reports progress; it raises DescriptionError if the plant ended."""
+
+    def stop(tick: int, outputs: Outputs) -> bool:
+        if tick % rate_hz == 0:
+            if not plant.is_alive():
+                raise DescriptionError("the plant's process has ended, and the flight with it")
+            if progress is not None:
+                progress(tick / rate_hz)
+        return orders.are_over(tick, outputs.time_ns)
+
+    return stop
 
 
 def _flown(loop: RealTimeLoop, rate_hz: int, refused: list[str]) -> RealTimeFlight:
