@@ -21,7 +21,7 @@ from firmware_py.runtime.disk import writing_to
 from firmware_py.runtime.interrupts import interrupts_deferred
 from firmware_py.runtime.realtime import quiet_garbage
 from firmware_py.runtime.recorder import Recorder
-from hil import DEFAULT_BUS
+from hil import DEFAULT_BUS, USUAL_RATE_HZ
 from hil.dock_script import DockScript
 from hil.faults import Faults
 from hil.force_script import ForceScript
@@ -116,7 +116,7 @@ class Bench:
         return Lockstep(self.firmware, [self.firmware_port], observers, self.patience_looks)
 
 
-def fleet_of(scenario: Scenario, bus: str = DEFAULT_BUS, rate_hz: int = 100) -> Fleet:
+def fleet_of(scenario: Scenario, bus: str = DEFAULT_BUS, rate_hz: int = USUAL_RATE_HZ) -> Fleet:
     """The fleet that a scenario's modules make up, all on one bus. Paths and bodies depend on neither bus nor rate."""
     modules = tuple(
         Module(number=m.number, vehicle=m.vehicle, body=m.body, cell=m.cell, rotation=m.rotation) for m in scenario.module

@@ -18,7 +18,7 @@ from firmware_py.description.schema import DescriptionError, Source, did_you_mea
 from firmware_py.runtime.folders import folder_of
 from firmware_py.runtime.interrupts import ended_at_once, interrupted_once
 from firmware_py.runtime.recorder import CAN_LOG
-from hil import DEFAULT_BUS
+from hil import DEFAULT_BUS, USUAL_RATE_HZ
 from hil.scenario_files import scenario_file, scenario_names
 
 if TYPE_CHECKING:
@@ -28,8 +28,6 @@ app = typer.Typer(help="The bench: the firmware against a simulated plant on the
 
 FAILED = 1
 """Exit status when a check failed."""
-USUAL_RATE_HZ = 100
-"""Tick rate of a flight for which none is named."""
 
 ScenarioName = Annotated[str, typer.Argument(help="scenario name (see `modcube hil list`), or .toml file")]
 Controller = Annotated[str, typer.Option(help="modcube, least_power, paper, paper_sequence, or a parameter file")]

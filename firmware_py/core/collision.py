@@ -13,10 +13,9 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.body import Body
-from firmware_py.core.rotations import V, to_matrix
+from firmware_py.core.rotations import M, V, cross, rotate
 from firmware_py.core.types import Estimate
 
-M = "float64[:,::1]"
 CLOSING_M_S, OWN_M_S = 0.08, 0.04
 """Speed at which two modules must near each other to count, and the least part of it that must be a body's own, so that it can help. A hull
 bears a slower bump (docks touch at up to 0.06), and a body may pass close by another slowly."""
@@ -34,7 +33,7 @@ def times_to_collision(
     Args:
         estimates: by number of the body. A body whose place is unknown is left out.
         wanted_w: by number, the (3,) velocity in the world that guidance wants, m/s.
-        pairs: numbers of two bodies each that are no obstacles to each other, because they dock.
+        pairs: numbers of two bodies each that are no obstacles to each other, because they dock or have just parted.
     """
     placed = [body for body in bodies if estimates[body.index].placed]
     times = dict.fromkeys((body.index for body in bodies), math.nan)
@@ -59,21 +58,15 @@ def _in_world(p_wb, q_wb, nu, r_bm, hull_m):  # type: ignore[no-untyped-def]
     """(m, 3) places of a body's modules, m, (m, 3) their velocities, m/s, world, and (m, 2) radius and half the height of the upright
     cylinders about their hulls, m.
     """
-    r_wb = to_matrix(q_wb)
     r_w, v_w, cylinder = np.empty_like(r_bm), np.empty_like(r_bm), np.zeros((r_bm.shape[0], 2))
     for m in range(r_bm.shape[0]):
-        x, y, z = r_bm[m]
-        vx, vy, vz = nu[0] + nu[4] * z - nu[5] * y, nu[1] + nu[5] * x - nu[3] * z, nu[2] + nu[3] * y - nu[4] * x
-        for k in range(3):
-            r_w[m, k] = p_wb[k] + r_wb[k, 0] * x + r_wb[k, 1] * y + r_wb[k, 2] * z
-            v_w[m, k] = r_wb[k, 0] * vx + r_wb[k, 1] * vy + r_wb[k, 2] * vz
-        a, b, c = 0.5 * hull_m[m]
-        for corner in range(4):  # the other four are opposite
-            i, j = a * (1 - 2 * (corner // 2)), b * (1 - 2 * (corner % 2))
-            north, east, down = r_wb[0, 0] * i + r_wb[0, 1] * j, r_wb[1, 0] * i + r_wb[1, 1] * j, r_wb[2, 0] * i + r_wb[2, 1] * j
-            radius = math.hypot(north + r_wb[0, 2] * c, east + r_wb[1, 2] * c)
-            cylinder[m, 0] = max(cylinder[m, 0], radius)
-            cylinder[m, 1] = max(cylinder[m, 1], abs(down + r_wb[2, 2] * c))
+        r_w[m] = p_wb + rotate(q_wb, r_bm[m])
+        v_w[m] = rotate(q_wb, nu[:3] + cross(nu[3:], r_bm[m]))
+        x, y, z = 0.5 * hull_m[m]
+        for corner_b in ((x, y, z), (x, -y, z), (-x, y, z), (-x, -y, z)):  # the other four are opposite
+            corner = rotate(q_wb, np.array(corner_b))
+            cylinder[m, 0] = max(cylinder[m, 0], math.hypot(corner[0], corner[1]))
+            cylinder[m, 1] = max(cylinder[m, 1], abs(corner[2]))
     return r_w, v_w, cylinder
 
 

@@ -301,7 +301,7 @@ class Guidance:
             return wish
         self.wanted_w = wish.v_w
         if wish.p_wb is not None:
-            way = np.nan_to_num(wish.p_wb - self._glider.at.p_wb)
+            way = np.nan_to_num(wish.p_wb - self._glider.at.p_wb)  # slowed near its end: a place before another body is permitted
             self.wanted_w = wish.v_w + way / max(self._least_s, float(np.linalg.norm(way)) / self._p.speed_m_s)
         return REST if health.collision_s < self._least_s else wish
 

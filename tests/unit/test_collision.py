@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import product
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from firmware_py.core.collision import CLOSING_M_S, OWN_M_S, times_to_collision
 from firmware_py.core.rotations import from_euler, rotate_back
 from firmware_py.core.types import NEVER_AGE_NS, Action, Estimate, Mode, Request, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
+from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble, assemble_vehicle
 from tests.unit.tanks import MODCUBE, FaultyTank
 
@@ -76,6 +78,15 @@ def test_hulls_touch_no_sooner_than_the_time_says(tilt: np.ndarray, towards: tup
     assert apart(time_s - 1e-6)
     touching_s = next(t for t in np.arange(time_s, 5.0, 0.01) if not apart(t))
     assert touching_s - time_s < (3.0**0.5 - 1.0) * EDGE_M / speed, "the cylinder is not much larger than the hull"
+
+
+@pytest.mark.parametrize("rotation", range(24))
+def test_hull_of_a_turned_module_is_as_large_as_its_corners_reach(rotation: int) -> None:
+    vehicle = load_vehicle("bluerov2_heavy")
+    body = assemble([(0, 0, 0)], [rotation], [vehicle])
+    corners = np.array(list(product(*(0.5 * vehicle.hull.size_m[:, None] * [-1.0, 1.0]))))
+    turned = Rotation.from_quat(body.q_bm[0][[1, 2, 3, 0]]).apply(corners)
+    assert body.hull_m[0] == pytest.approx(np.ptp(turned, axis=0), rel=1e-12)
 
 
 def test_hull_above_another_has_its_height_for_a_reach() -> None:
