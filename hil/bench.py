@@ -130,7 +130,7 @@ def script_of(scenario: Scenario, fleet: Fleet) -> Orders:
 
 
 def open_bench(
-    stack: ExitStack, scenario: Scenario, seed: int, parameters: Parameters, bus: str = DEFAULT_BUS, rate_hz: int = 100
+    stack: ExitStack, scenario: Scenario, seed: int, parameters: Parameters, bus: str = DEFAULT_BUS, rate_hz: int = USUAL_RATE_HZ
 ) -> Bench:
     """A bench whose two ports are closed with `stack`. Raises DescriptionError and PortError."""
     fleet = fleet_of(scenario, bus, rate_hz)
@@ -148,7 +148,7 @@ def fly_scenario(
     parameters: Parameters,
     out: Path,
     bus: str = DEFAULT_BUS,
-    rate_hz: int = 100,
+    rate_hz: int = USUAL_RATE_HZ,
     progress: Callable[[float], None] | None = None,
     before_logs: Callable[[], None] | None = None,
 ) -> float:

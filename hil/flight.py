@@ -21,7 +21,7 @@ from firmware_py.description.signals import read_signals
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import groups_of, passive_axes
 from firmware_py.runtime.recorder import CAN_LOG
-from hil import DEFAULT_BUS
+from hil import DEFAULT_BUS, USUAL_RATE_HZ
 from hil.bench import SCRIPTS, fleet_of, fly_scenario
 from hil.checks import RESULT_FILE, Flown, Limit, Result, judge, write_result
 from hil.dock_plot import DOCK_PLOT, write_dock_plot
@@ -59,7 +59,7 @@ def fly_and_judge(
     parameters: Parameters,
     out: Path,
     bus: str = DEFAULT_BUS,
-    rate_hz: int = 100,
+    rate_hz: int = USUAL_RATE_HZ,
     progress: Callable[[float], None] | None = None,
     realtime: bool = False,
     unusual: Sequence[str] = (),

@@ -94,7 +94,7 @@ class Fuzzed:
 def fuzz_flight(frames: int, seed: int = 0) -> Fuzzed:
     """Flies a hover until the firmware was fed `frames` frames, A_TICK fuzzed ones in every tick. The firmware's exceptions propagate."""
     scenario = load_scenario("hover")
-    fleet = fleet_of(scenario, "virtual:fuzz", 100)
+    fleet = fleet_of(scenario, "virtual:fuzz")
     codec = Codec.load()
     firmware = compose(fleet, Parameters())
     world = make_world(scenario, seed, fleet.period_ns)

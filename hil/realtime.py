@@ -28,6 +28,7 @@ from firmware_py.runtime.clock import MonotonicClock
 from firmware_py.runtime.interrupts import interrupts_deferred, signals_blocked
 from firmware_py.runtime.realtime import PLANT_PRIORITY, TICK_PRIORITY, quiet_garbage, read_libraries, real_time, use_priority
 from firmware_py.runtime.recorder import Recorder
+from hil import USUAL_RATE_HZ
 from hil.bench import fleet_of, script_of
 from hil.orders import Orders
 from hil.plant_process import CHUNK_NS, PlantProcess, check_served
@@ -88,7 +89,7 @@ def fly_in_real_time(
     parameters: Parameters,
     out: Path,
     bus: str,
-    rate_hz: int = 100,
+    rate_hz: int = USUAL_RATE_HZ,
     progress: Callable[[float], None] | None = None,
     start_method: Literal["spawn", "fork"] = "spawn",
     observers: Sequence[Observer] = (),

@@ -21,6 +21,7 @@ from firmware_py.bus.codec import Codec
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.types import Action, Inputs, Mode, Outputs, Request, Sticks
 from firmware_py.description.parameters import Parameters
+from hil import USUAL_RATE_HZ
 from hil.bench import fly_scenario, open_bench
 from hil.fault_table import SINGLE_FAULTS
 from hil.flight import flight_of, wanted_in
@@ -39,7 +40,7 @@ COMMANDED_N = 0.3
 LEFT_OUT = re.compile(r"thruster (\d+) of module 0 .*: left out")
 
 
-def flown(scenario: Scenario, seed: int, parameters: Parameters | None = None, rate_hz: int = 100) -> Flight:
+def flown(scenario: Scenario, seed: int, parameters: Parameters | None = None, rate_hz: int = USUAL_RATE_HZ) -> Flight:
     """Flies a scenario and returns the flight; its logs are discarded."""
     with tempfile.TemporaryDirectory() as folder:
         fly_scenario(scenario, seed, parameters or Parameters(), Path(folder), f"virtual:{Path(folder).name}", rate_hz)
@@ -134,7 +135,7 @@ ICM_20602 = Imu(math.radians(0.004) * math.sqrt(50.0), 100e-6 * 9.81 * math.sqrt
 """IMU of many autopilots: 0.004 deg/s and 100 ug per root of Hz (TDK InvenSense DS-000176), over the 50 Hz of 100 samples a second."""
 
 
-def hover_blind(seed: int, imu: Imu | None = None, rate_hz: int = 100) -> BlindFlight:
+def hover_blind(seed: int, imu: Imu | None = None, rate_hz: int = USUAL_RATE_HZ) -> BlindFlight:
     """Flies a hover that loses the tags for a while. With another IMU the filter's noise parameters keep their ratio to the sensor's."""
     scenario, parameters = load_scenario("hover-blind"), Parameters()
     for name, sigma in imu._asdict().items() if imu is not None else ():
