@@ -50,6 +50,11 @@ class ThrusterSet:
     module: np.ndarray
     channel: np.ndarray
 
+    @property
+    def full_wrench(self) -> np.ndarray:
+        """(6,) largest wrench along each axis, whatever it makes along the others, mean of both directions."""
+        return np.asarray(0.5 * np.abs(self.matrix) @ (self.f_max - self.f_min))
+
 
 def rank_by(values: np.ndarray) -> int:
     """Rank of a matrix with these singular values, largest first."""
@@ -128,6 +133,8 @@ class Body:
         supply_power_w: (m,) power that each module's supply can give to its thrusters and magnets.
         hull_m: (m, 3) edges of each module's hull, a box, along the axes of the body, m.
         reach_m: largest distance of any point of its hulls from the centre of mass, m.
+        deceleration: (2,) with which all its thrusters stop its motion and its turn along the axis where that takes longest, passive axes
+            left out, m/s^2 and rad/s^2.
         depth_rating_m: largest depth that all its vehicles are made for, m.
         cells: (m, 3) lattice cells; name: for display.
         faces: per module the kinds of its six faces, a letter each, as in the vehicle file (P probe, D drogue).
@@ -155,6 +162,7 @@ class Body:
     supply_power_w: np.ndarray
     hull_m: np.ndarray
     reach_m: float
+    deceleration: np.ndarray
     passive: tuple[int, ...]
     depth_rating_m: float
 

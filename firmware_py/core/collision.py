@@ -1,7 +1,8 @@
-"""Time to collision of each body with the others: a figure of the health (`collision_s`).
+"""Time that each body has left before it must brake to stop before another: a figure of the health (`collision_s`).
 
 All bodies move on as they do now; and each, besides, as its guidance wants to: one that waits before another would reach it as soon as it
-goes on. A hull counts as the upright cylinder about its box as it is turned now.
+goes on. A hull counts as the upright cylinder about its box as it is turned now. Braking takes the longer way of the set-point, which
+changes speed through a filter, and of thrusters that are too weak to follow it.
 """
 
 from __future__ import annotations
@@ -21,18 +22,34 @@ CLOSING_M_S, OWN_M_S = 0.08, 0.04
 bears a slower bump (docks touch at up to 0.06), and a body may pass close by another slowly."""
 
 
-def times_to_collision(
+def braking_s(speed: np.ndarray, deceleration: np.ndarray, bandwidth: float) -> np.ndarray:
+    """(...) braking distance over the present speed, s: the time that is lost to a collision if a body begins to brake now.
+
+    A set-point that comes to rest through the critically damped filter of core.setpoint covers 2 v / bandwidth, and a body that brakes with
+    all its force v^2 / (2 a); the sum bounds what both cover together.
+
+    Args:
+        speed: (..., 2) speed, m/s, and turning rate, rad/s.
+        deceleration: (..., 2) as Body.deceleration.
+        bandwidth: of the filter, rad/s.
+    """
+    return np.asarray(2.0 / bandwidth + 0.5 * np.max(speed / deceleration, axis=-1))
+
+
+def times_to_brake(
     bodies: Sequence[Body],
     estimates: Mapping[int, Estimate],
     wanted_w: Mapping[int, np.ndarray],
+    bandwidth: float,
     pairs: Collection[tuple[int, int]] = (),
 ) -> dict[int, float]:
-    """Time in which each body reaches another towards which it moves, or wants to move, s, by its number; NaN if there is none, 0 if it is
-    there already.
+    """Time after which each body must brake to stop before another towards which it moves, or wants to move, s, by its number; NaN if there
+    is none, 0 if it is too late.
 
     Args:
         estimates: by number of the body. A body whose place is unknown is left out.
         wanted_w: by number, the (3,) velocity in the world that guidance wants, m/s.
+        bandwidth: with which the set-points come to rest, rad/s.
         pairs: numbers of two bodies each that are no obstacles to each other, because they dock or have just parted.
     """
     placed = [body for body in bodies if estimates[body.index].placed]
@@ -48,9 +65,15 @@ def times_to_collision(
     modules = [_in_world(*estimates[body.index][:3], body.r_bm, body.hull_m) for body in placed]
     of_body = np.repeat(np.arange(len(placed)), [len(body.modules) for body in placed])
     r_w, v_w, cylinder = map(np.concatenate, zip(*modules, strict=True))
-    wanted = np.array([wanted_w[number] for number in numbers])[of_body]
-    soonest = np.fmin(*(_soonest(r_w, own_w, v_w, cylinder, of_body, ignored) for own_w in (v_w, wanted)))
-    return times | dict(zip(numbers, soonest.tolist(), strict=True))
+    wanted = np.array([wanted_w[number] for number in numbers])
+    nu = np.array([estimates[number].nu for number in numbers]).reshape(-1, 2, 3)
+    deceleration = np.array([body.deceleration for body in placed])
+    own, asked = np.linalg.norm(nu, axis=2), np.pad(np.linalg.norm(wanted, axis=1, keepdims=True), ((0, 0), (0, 1)))
+    left = np.fmin(
+        _soonest(r_w, v_w, v_w, cylinder, of_body, ignored) - braking_s(own, deceleration, bandwidth),
+        _soonest(r_w, wanted[of_body], v_w, cylinder, of_body, ignored) - braking_s(asked, deceleration, bandwidth),
+    )
+    return times | dict(zip(numbers, np.maximum(left, 0.0).tolist(), strict=True))
 
 
 @njit(f"Tuple(({M},{M},{M}))({V},{V},{V},{M},{M})", cache=True)

@@ -93,7 +93,7 @@ TABLE = (
     Row("module_silent", "a module is silent", "silent_s", LASTS),
     Row("ticks_missed", "ticks missed", "missed_ticks_per_s", ": {:.0f} in a second"),
     Row("fence", "outside the fence", "outside_m", " by {:.2f} m", modes=MOVING),
-    Row("collision", "another body is in the way", "collision_s", ", {:.1f} s away", below=True, modes=FREE, warned_modes=PILOTED),
+    Row("collision", "another body is in the way", "collision_s", ", {:.1f} s to brake", below=True, modes=FREE, warned_modes=PILOTED),
     Row("ground_lost", "ground station silent", "ground_age_s", LASTS, modes=ANY - {Mode.AUTO, Mode.SURFACE}),
     Row("pilot_lost", "pilot silent", "pilot_age_s", LASTS, modes=PILOTED),
     Row("thruster_lost", "a thruster is out", "thruster_lost"),

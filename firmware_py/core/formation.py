@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from firmware_py.core.body import Body
-from firmware_py.core.collision import times_to_collision
+from firmware_py.core.collision import times_to_brake
 from firmware_py.core.docking import DockingStage
 from firmware_py.core.docking_decisions import Decisions, Join, Part
 from firmware_py.core.docking_pairs import APART, LOOSE
@@ -78,11 +78,11 @@ class Formation:
         outputs.events += self.docking.events
 
     def watch_distances(self, time_ns: int, estimates: dict[int, Estimate]) -> None:
-        """Tells each body's health in which time it reaches another. Two that dock or have just parted are no obstacles to each other."""
+        """Tells each body's health when it must brake before another. Two that dock or have just parted are no obstacles to each other."""
         self._parted = [parted for parted in self._parted if time_ns - parted[0] <= PARTED_NS]
         wanted_w = {pipeline.body.index: pipeline.guidance.wanted_w for pipeline in self.pipelines}
         pairs = [*self.docking.pairs, *(pieces for _, pieces in self._parted)]
-        times_s = times_to_collision(self.bodies, estimates, wanted_w, pairs)
+        times_s = times_to_brake(self.bodies, estimates, wanted_w, self.parameters.steering.bandwidth, pairs)
         for pipeline in self.pipelines:
             pipeline.health.collision_s = times_s[pipeline.body.index]
 

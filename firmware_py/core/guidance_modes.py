@@ -13,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core.body import Body
+from firmware_py.core.collision import braking_s
 from firmware_py.core.failsafes import FREE, Level
 from firmware_py.core.health import Health
 from firmware_py.core.rotations import difference, heading, rotate, rotate_back
@@ -103,13 +104,14 @@ class Guidance:
 
     def retune(self, parameters: Parameters) -> None:
         """Applies new limits from this tick on; set-point and requests stay."""
-        p, t = parameters.steering, self._body.thrusters
+        p = parameters.steering
         self._p, self._fence = p, parameters.fence
         self._lead_s = parameters.control.lead_s
         f = parameters.failsafes
         self._no_place_s, self._no_depth_s = f.tag_lost_limit, f.depth_unknown_limit
         self._least_s = f.collision_limit if f.collision_action >= Level.HOLD else 0.0
-        self._full_stick = p.stick_share * (0.5 * np.abs(t.matrix) @ (t.f_max - t.f_min))
+        self._arrival_s = f.collision_limit + float(braking_s(np.array([p.speed_m_s, 0.0]), self._body.deceleration, p.bandwidth))
+        self._full_stick = p.stick_share * self._body.thrusters.full_wrench
         self._lift_n = p.surface_force_n * len(self._body.modules)
         depth_m = self._body.r_bm[:, 2]
         self._surface_m = p.surface_depth_m + float(depth_m.mean() - depth_m.min())  # the highest module is to be at the surface
@@ -302,7 +304,7 @@ class Guidance:
         self.wanted_w = wish.v_w
         if wish.p_wb is not None:
             way = np.nan_to_num(wish.p_wb - self._glider.at.p_wb)  # slowed near its end: a place before another body is permitted
-            self.wanted_w = wish.v_w + way / max(self._least_s, float(np.linalg.norm(way)) / self._p.speed_m_s)
+            self.wanted_w = wish.v_w + way / max(self._arrival_s, float(np.linalg.norm(way)) / self._p.speed_m_s)
         return REST if health.collision_s < self._least_s else wish
 
     def _guided(self, time_ns: int) -> Wish:

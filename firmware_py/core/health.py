@@ -89,7 +89,7 @@ class Health(NamedTuple):
     esc_unknown: tuple[Place, ...] = ()
     """Places without a thruster by the vehicle file from which an ESC answers."""
     collision_s: float = math.nan
-    """Time in which the body reaches another that it moves towards (core.collision); NaN if there is none."""
+    """Time after which the body must brake to stop before another that it moves towards (core.collision), s; NaN if there is none."""
     without_thrust: tuple[str, ...] = ()
     """Axes that no thruster of the body can push although the vehicle does not declare them passive."""
 

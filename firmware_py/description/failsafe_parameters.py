@@ -175,10 +175,10 @@ class Failsafes:
     fence_delay_s: float = delay(0.2, "FS_FENC_S")
     fence_action: int = action(2, "FS_FENC_ACT")
     fence_latched: int = latched(0, "FS_FENC_LAT")
-    # another body is in the way; docks and undocks give way by themselves. The limit leaves room at speeds up to 0.5 m/s (measured)
+    # another body is in the way; docks and undocks give way by themselves. The delay takes half of the limit, the other half is margin
     collision_limit: float = quantity(
-        0.5, unit="s", low=0, high=60,
-        help="least permitted time in which the body would reach another one towards which it moves", mavlink="FS_COL_LIM"
+        0.2, unit="s", low=0, high=60,
+        help="least permitted time until the body must brake to stop before another one towards which it moves", mavlink="FS_COL_LIM"
     )
     collision_delay_s: float = delay(0.1, "FS_COL_S")
     collision_action: int = action(2, "FS_COL_ACT")

@@ -120,6 +120,7 @@ def _body(placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: fl
     mass = _mass_matrix(balance, placements)
     tags = [(k, tag) for k, p in enumerate(placements) for tag in p.vehicle.tag]
     thrusters = thruster_set(placements, r_bm)
+    passive = _passive(placements, thrusters.matrix)
     return Body(
         name=_name(placements),
         modules=modules,
@@ -142,9 +143,16 @@ def _body(placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: fl
         supply_power_w=np.array([_power(p.vehicle) for p in placements]),
         hull_m=np.array([np.abs(MATRICES[p.rotation] @ p.vehicle.hull.size_m) for p in placements]),
         reach_m=max(_reach_m(p.vehicle, r) for p, r in zip(placements, r_bm, strict=True)),
-        passive=_passive(placements, thrusters.matrix),
+        deceleration=_deceleration(thrusters, mass, passive),
+        passive=passive,
         depth_rating_m=min(p.vehicle.depth_rating_m for p in placements),
     )
+
+
+def _deceleration(thrusters: ThrusterSet, mass: np.ndarray, passive: Sequence[int]) -> np.ndarray:
+    along = thrusters.full_wrench / np.diag(mass)
+    along[list(passive)] = np.inf
+    return np.asarray(along.reshape(2, 3).min(axis=1))
 
 
 def passive_axes(fleet: Fleet, members: Sequence[int], vehicles: Mapping[str, Vehicle]) -> tuple[int, ...]:

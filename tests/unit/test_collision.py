@@ -1,5 +1,6 @@
 """Two bodies in each other's way: the time to their collision, and that they stop before it."""
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from itertools import product
@@ -9,8 +10,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core.body import Body
-from firmware_py.core.collision import CLOSING_M_S, OWN_M_S, times_to_collision
+from firmware_py.core.collision import CLOSING_M_S, OWN_M_S, braking_s, times_to_brake
 from firmware_py.core.rotations import from_euler, rotate_back
+from firmware_py.core.setpoint import REST, Glider
 from firmware_py.core.types import NEVER_AGE_NS, Action, Estimate, Mode, Request, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
@@ -23,8 +25,13 @@ TOUCH_M = EDGE_M * 2.0**0.5
 ZERO, LEVEL = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
 
 
+def at_once(body: Body) -> Body:
+    """The body, with thrusters that stop it at once: its time to brake is that to the collision."""
+    return dataclasses.replace(body, deceleration=np.full(2, math.inf))
+
+
 def single(number: int) -> Body:
-    return assemble([(0, 0, 0)], [0], [MODCUBE], [number])
+    return at_once(assemble([(0, 0, 0)], [0], [MODCUBE], [number]))
 
 
 def at(place: Sequence[float], velocity: Sequence[float] = (0.0, 0.0, 0.0), turn: float = 0.0, **changes: object) -> Estimate:
@@ -38,7 +45,7 @@ def pair(
 ) -> tuple[float, float]:
     """Times of bodies 0 and 5; `wanted`: velocity that the guidance of body 0 wants."""
     bodies = [single(0), single(5)]
-    times_s = times_to_collision(bodies, {0: first, 5: second}, {0: np.array(wanted), 5: ZERO}, pairs)
+    times_s = times_to_brake(bodies, {0: first, 5: second}, {0: np.array(wanted), 5: ZERO}, math.inf, pairs)
     return times_s[0], times_s[5]
 
 
@@ -142,25 +149,60 @@ def test_body_that_waits_before_another_has_the_time_that_it_would_need() -> Non
 
 def test_corner_of_a_turning_row_counts_with_its_own_speed() -> None:
     """A row of three turns in place: its end comes round to a body that its middle does not approach."""
-    row, other = assemble([(-1, 0, 0), (0, 0, 0), (1, 0, 0)], [0] * 3, [MODCUBE] * 3, [1, 2, 3]), single(8)
+    row, other = at_once(assemble([(-1, 0, 0), (0, 0, 0), (1, 0, 0)], [0] * 3, [MODCUBE] * 3, [1, 2, 3])), single(8)
     turning = at([0.0, 0.0, 1.0], turn=1.0)
     estimates = {1: turning, 8: at([PITCH_M, 0.6, 1.0])}
-    times = times_to_collision([row, other], estimates, {1: ZERO, 8: ZERO})
+    times = times_to_brake([row, other], estimates, {1: ZERO, 8: ZERO}, math.inf)
     assert times[1] == pytest.approx((0.6 - TOUCH_M) / PITCH_M, rel=1e-6)
     assert math.isnan(times[8])
 
 
 def test_vehicle_alone_has_nobody_to_meet() -> None:
     alone = at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0])
-    assert math.isnan(times_to_collision([assemble_vehicle(MODCUBE)], {0: alone}, {0: np.array([0.2, 0.0, 0.0])})[0])
+    assert math.isnan(times_to_brake([assemble_vehicle(MODCUBE)], {0: alone}, {0: np.array([0.2, 0.0, 0.0])}, 6.0)[0])
+
+
+@pytest.mark.parametrize(("speed", "bandwidth"), [(0.1, 6.0), (0.3, 1.0), (1.0, 6.0), (2.0, 30.0)])
+def test_braking_covers_the_set_point_s_way_and_that_of_thrusters_at_their_limit(speed: float, bandwidth: float) -> None:
+    """Against both alone, in steps of 1 ms: the set-point by the glider itself, full force by its time to rest."""
+    deceleration, dt_s = 1.6, 1e-3
+    glider = Glider(bandwidth, speed, 1.0)
+    glider.put(Setpoint(ZERO, LEVEL, np.array([speed, 0.0, 0.0]), ZERO, ZERO, ZERO))
+    for _ in range(round(15.0 / bandwidth / dt_s)):
+        glider.step(REST, dt_s)
+    at_full_force_m = sum(speed - deceleration * t for t in np.arange(0.0, speed / deceleration, dt_s)) * dt_s
+    braking = braking_s(np.array([speed, 0.0]), np.array([deceleration, 20.0]), bandwidth)
+    assert speed * braking == pytest.approx(glider.at.p_wb[0] + at_full_force_m, abs=1e-3 * speed)
+    assert braking_s(np.array([0.0, 0.5]), np.array([deceleration, 5.0]), 4.0) == pytest.approx(0.5 + 0.5 * 0.1)
+
+
+def test_time_to_brake_is_that_to_the_collision_less_the_braking() -> None:
+    bodies = [assemble([(0, 0, 0)], [0], [MODCUBE], [number]) for number in (0, 5)]
+    estimates = {0: at(ZERO, [0.2, 0.0, 0.0]), 5: at([1.0, 0.0, 0.0])}
+    alone_s = (1.0 - TOUCH_M) / 0.2 - braking_s(np.array([0.2, 0.0]), bodies[0].deceleration, 6.0)
+    assert times_to_brake(bodies, estimates, {0: ZERO, 5: ZERO}, 6.0)[0] == pytest.approx(alone_s)
+    wanted_s = (1.0 - TOUCH_M) / 0.4 - braking_s(np.array([0.4, 0.0]), bodies[0].deceleration, 6.0)
+    assert times_to_brake(bodies, estimates, {0: np.array([0.4, 0.0, 0.0]), 5: ZERO}, 6.0)[0] == pytest.approx(wanted_s)
+    assert times_to_brake(bodies, estimates, {0: ZERO, 5: ZERO}, 0.1)[0] == 0.0, "it brakes too late"
+
+
+def test_deceleration_is_that_of_the_weakest_axis_which_is_steered() -> None:
+    """ModCube: four thrusters at 45 deg along x and y; four along z. A BlueROV2's pitch is left to buoyancy."""
+    body = assemble_vehicle(MODCUBE)
+    full_n = 0.5 * float(body.thrusters.f_max[0] - body.thrusters.f_min[0])
+    assert body.deceleration[0] == pytest.approx(4.0 * math.sqrt(0.5) * full_n / body.mass[0, 0])
+    assert body.deceleration[0] < 4.0 * full_n / body.mass[2, 2]
+    rov = assemble_vehicle(load_vehicle("bluerov2"))
+    along = rov.thrusters.full_wrench / np.diag(rov.mass)
+    assert rov.passive == (4,) and rov.deceleration[1] == pytest.approx(min(along[3], along[5]))
 
 
 # ------------------------------------------------------------ whole ticks
 
 
-def two_in_the_water(parameters: Parameters) -> FaultyTank:
+def two_in_the_water(parameters: Parameters, from_m: float = 0.0) -> FaultyTank:
     tank = FaultyTank([(0, 0, 0), (1, 0, 0)], parameters, apart=True)
-    for state, x_m in zip(tank.states, (0.0, 1.2), strict=True):
+    for state, x_m in zip(tank.states, (from_m, 1.2), strict=True):
         state[:7] = [x_m, 0.0, 0.8, *from_euler(0.0, 0.0, 0.0)]
     tank.run(2.0)
     tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
@@ -183,6 +225,16 @@ def test_body_that_is_sent_through_another_stops_before_it(mode: Mode) -> None:
     assert TOUCH_M < distances(tank).min() < 0.6
     assert [record.mode for record in tank.outputs[-1].records] == [Mode.POSHOLD] * 2
     assert np.linalg.norm(tank.states[0][7:10]) < 0.01 and np.linalg.norm(tank.states[1][:3] - [1.2, 0.0, 0.8]) < 0.01
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("speed_m_s", "bandwidth"), [(1.0, 6.0), (0.3, 1.5)], ids=["fast", "soft"])
+def test_body_that_is_fast_or_changes_speed_slowly_brakes_sooner(speed_m_s: float, bandwidth: float) -> None:
+    parameters = Parameters().replace("steering.speed_m_s", speed_m_s).replace("steering.bandwidth", bandwidth)
+    tank = two_in_the_water(parameters, from_m=-1.5)
+    tank.run(12.0, Request(Action.HOLD, 0, Setpoint(np.array([4.0, 0.0, 0.8]), LEVEL, ZERO, ZERO, ZERO, ZERO)))
+    assert tank.when("fail-safe on: another body is in the way")
+    assert distances(tank).min() > TOUCH_M and np.linalg.norm(tank.states[0][7:10]) < 0.01
 
 
 @pytest.mark.slow

@@ -74,8 +74,8 @@ def test_push_counts_only_while_no_tag_tells_what_it_does() -> None:
 
 
 def test_nearer_body_is_the_worse_one() -> None:
-    assert alarms_of(quick("collision"), GOOD._replace(collision_s=0.4))
-    assert alarms_of(quick("collision"), GOOD._replace(collision_s=0.6)) == []
+    assert alarms_of(quick("collision"), GOOD._replace(collision_s=0.1))
+    assert alarms_of(quick("collision"), GOOD._replace(collision_s=0.3)) == []
 
 
 COUNTS = {
@@ -233,7 +233,7 @@ WORDS = {
     "module_silent": "a module is silent for 0.5 s",
     "ticks_missed": "ticks missed: 5 in a second",
     "fence": "outside the fence by 0.00 m",
-    "collision": "another body is in the way, 0.5 s away",
+    "collision": "another body is in the way, 0.2 s to brake",
     "ground_lost": "ground station silent for 5.0 s",
     "pilot_lost": "pilot silent for 1.0 s",
     "thruster_lost": "a thruster is out",
