@@ -73,6 +73,8 @@ SHOWN = {
 """Metrics in the order in which tables show them."""
 DOCKING = ("docked", "gap_min_m", "tries", "jams", "outcome", "false_declarations", "docked_rmse_m", "join_jump_n")
 """Metrics that only a run with [[step]]s has."""
+AS_ASKED = ("docked", "outcome")
+"""Those of them that judge the docks and undocks of the [[step]]s."""
 FORCE_METRIC = re.compile(r"force_(rmse|fit|difference)(\d?)_(?:(\w+)_)?(on|off)(?:_n)?")
 
 

@@ -13,7 +13,7 @@ from firmware_py.description.schema import did_you_mean, is_file_name, limits_of
 from firmware_py.description.vehicle import FACE_NAMES, Vehicle, face_mismatch, load_vehicle
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
-from hil.metrics import DOCKING, SHOWN, shown
+from hil.metrics import AS_ASKED, DOCKING, SHOWN, shown
 from hil.starts import MOVE_IN, hulls_in_walls, inscribed_radius_m, remedy, sphere_in_wall
 
 if TYPE_CHECKING:
@@ -305,6 +305,8 @@ def _in_checks(scenario: Scenario) -> Iterator[Mistake]:
         if check.metric not in names:
             known = f"a run of the kind {scenario.task.kind} has {', '.join(names)}"
             yield ("check", i, "metric"), f"{check.metric!r} is unknown; {did_you_mean(check.metric, names)}{known}"
+        if check.metric in AS_ASKED and not any(step.do in ("dock", "undock") for step in scenario.step):
+            yield ("check", i, "metric"), f"{check.metric} says whether docks and undocks succeeded, and no [[step]] is one; leave it out"
         first = next(k for k, other in enumerate(scenario.check) if other.metric == check.metric)
         if first < i:
             yield ("check", i, "metric"), f"{check.metric} is checked by another [[check]] already; give low and high in one"

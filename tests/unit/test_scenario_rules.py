@@ -31,6 +31,8 @@ Load = Callable[..., Scenario]
 WHOLE_BUS = ("estop", "foreign_sync", "foreign_command", "process_killed")
 """Kinds of faults that concern no single module."""
 DOCK_STEP = '[[step]]\ndo = "dock"\nmodule = 2\nface = "-x"\ntarget_module = 1\ntarget_face = "+x"\n'
+WAIT_STEP = '[[step]]\ndo = "wait"\n'
+MOVE_STEP = '[[step]]\ndo = "move"\nmodule = 2\nposition_m = [0.078, 0.4, 0.38]\nduration_s = 20.0\n'
 ASIDE = '[[module]]\nnumber = 2\nposition_m = [0.45, 0.45, 0.38]\n'
 SECOND = '[[module]]              # the active one, on the right\nnumber = 2\nvehicle = "modcube"\nposition_m = [0.40, 0.0, 0.38]\n'
 
@@ -104,6 +106,8 @@ def load(tmp_path: Path) -> Load:
         ("dock", "number = 2", "number = 1", "module[1].number: 1 is the number of another module too"),
         ("hover", "position_rmse_m", "position_rsme_m", "check[0].metric: 'position_rsme_m' is unknown; did you mean position_rmse_m? a"),
         ("hover", "position_rmse_m", "docked", "'docked' is unknown; a run of the kind hover has position_rmse_m, "),
+        ("dock", DOCK_STEP, WAIT_STEP, "check[0].metric: docked says whether docks and undocks succeeded, and no [[step]] is one; "),
+        ("dock-near-miss", "false_declarations", "outcome", "check[0].metric: outcome says whether docks and undocks succeeded, and no"),
         ("force-tracking", "force_difference_off", "force_rmse_three_on_n", "a run of the kind force has position_rmse_m, "),
         ("hover", "low = 0.7\nhigh = 1.4", "low = 1.4\nhigh = 0.7", "check[3].low: 1.4 is above high, 0.7"),
         ("hover", "high = 0.005", "high = -0.05", "check[0].high: -0.05, and position_rmse_m is 0 or more; no value would pass"),
@@ -249,7 +253,7 @@ def test_scenario_of_the_package_has_no_mistake(name: str) -> None:
 
 def test_wait_is_about_no_module(load: Load) -> None:
     """The modules that a `wait` step names by default need not exist."""
-    scenario = load("dock", DOCK_STEP, '[[step]]\ndo = "wait"\n')
+    scenario = load("dock-near-miss", MOVE_STEP, WAIT_STEP)
     renumbered = dataclasses.replace(scenario, module=tuple(dataclasses.replace(m, number=m.number + 2) for m in scenario.module))
     script = DockScript(renumbered, fleet_of(renumbered, "virtual:wait", 100))
     nothing = Outputs(tick=1, time_ns=0, modules=[], estop=False, events=[], records=[])
