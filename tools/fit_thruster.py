@@ -61,17 +61,17 @@ def read_points(path: Path) -> dict[str, np.ndarray]:
     rows = _rows(path)
     points = {}
     for name in (*COLUMNS, *OPTIONAL):
-        if name in rows[0]:
-            points[name] = np.array([_number(row[name], path, line) for line, row in enumerate(rows, 2)])
+        if name in rows[0][1]:
+            points[name] = np.array([_number(row[name], path, line) for line, row in rows])
     for name, low, high, permitted in (("command", -1.0, 1.0, "-1 to 1"), ("voltage_v", VOLTAGE.low, VOLTAGE.high, describe(VOLTAGE))):
         wrong = np.flatnonzero((points[name] < low) | (points[name] > high)) if name in points else np.array([])
         if wrong.size:
-            raise DescriptionError(f"{path}:{2 + wrong[0]}: {name} {points[name][wrong[0]]:g} is out of range; permitted: {permitted}")
+            raise DescriptionError(f"{path}:{rows[wrong[0]][0]}: {name} {points[name][wrong[0]]:g} is out of range; permitted: {permitted}")
     return points
 
 
-def _rows(path: Path) -> list[dict[str, str | None]]:
-    """Reads the rows: at least one, each with COLUMNS."""
+def _rows(path: Path) -> list[tuple[int, dict[str, str | None]]]:
+    """Reads the rows, each with its line in the file: at least one, each with COLUMNS."""
     try:
         with path.open(encoding="utf-8-sig", newline="") as file:
             reader = csv.DictReader(file)
@@ -84,7 +84,7 @@ def _rows(path: Path) -> list[dict[str, str | None]]:
             for name in header:
                 if name not in (*COLUMNS, *OPTIONAL) and (hint := did_you_mean(name, [n for n in OPTIONAL if n not in header])):
                     raise DescriptionError(f"{path}:1: column '{name}' is unknown; {hint}else give it another name or leave it out")
-            rows = [_whole(row, path, line) for line, row in enumerate(reader, 2)]
+            rows = [(reader.line_num, _whole(row, path, reader.line_num)) for row in reader]
     except (UnicodeDecodeError, csv.Error) as error:
         raise DescriptionError(f"{path}: is no CSV in UTF-8: {error}") from None
     if not rows:
