@@ -39,6 +39,8 @@ FACE_KINDS = {"P": "a probe", "D": "a drogue", "-": "no docking face"}
 AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 """Degrees of freedom, in the order of a wrench and of every array of six here."""
 
+MOST_DAMPING_PER_S = 50.0
+"""Largest linear damping over mass or inertia, 1/s: half of that at which the firmware's midpoint rule is unstable at 50 Hz."""
 MOST_THRUSTERS = 8
 """Thrusters of one module for which its CAN frames have commands."""
 
@@ -276,6 +278,7 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
     vehicle: Vehicle = build(Vehicle, table, source)
     _check_body(vehicle, source)
     _check_drag(vehicle.drag, source)
+    _check_damping(vehicle, source)
     if vehicle.hull.mesh:
         mesh = (path.parent / vehicle.hull.mesh).absolute()  # for logs, and for printing the vehicle as a file elsewhere
         if not is_there(mesh, Path.is_file):
@@ -318,6 +321,17 @@ def _check_drag(drag: Drag, source: Source) -> None:
         what = f"{drag.cd_edge:g} is too small for drag.cd_face, {drag.cd_face:g}: along a space diagonal the coefficient, "
         what += "(4 cd_edge - cd_face) / 3, would not be above 0"
         raise source.error(("drag", "cd_edge"), f"{what}; cd_edge must be above cd_face / 4, here {drag.cd_face / 4.0:g}")
+
+
+def _check_damping(vehicle: Vehicle, source: Source) -> None:
+    """Raises DescriptionError, which names the line, if linear damping would stop the vehicle within a tick or two."""
+    inertial, damping = vehicle.inertial, vehicle.drag.linear
+    rates_per_s = damping / (np.r_[np.full(3, inertial.wet_kg), np.diag(inertial.inertia)] + inertial.added)
+    worst = int(np.argmax(rates_per_s))
+    if rates_per_s[worst] > MOST_DAMPING_PER_S:
+        most = damping[worst] * MOST_DAMPING_PER_S / rates_per_s[worst]
+        what = f"{damping[worst]:g} in {AXES[worst]} stops this vehicle within {1e3 / rates_per_s[worst]:.3g} ms, too fast for the ticks"
+        raise source.error(("drag", "linear"), f"{what}; with its mass and added mass at most {most:.3g}")
 
 
 def find_vehicles(modules: Sequence[_Module], source: Source) -> tuple[_Module, ...]:

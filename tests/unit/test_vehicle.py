@@ -237,6 +237,11 @@ def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
             "cd_face = 1.05\ncd_edge = 0.80", "cd_face = 5\ncd_edge = 0.1",
             r"odd.toml:23: drag.cd_edge: 0.1 is too small for drag.cd_face, 5: .* must be above cd_face / 4, here 1.25",
         ),
+        (
+            "cd_edge = 0.80", "cd_edge = 0.80\nlinear = [1e4, 0, 0, 0, 0, 0]",
+            r"toml:24: drag.linear: 10000 in surge stops this vehicle within 1\.55 ms, too fast for the ticks; .* at most 775$",
+        ),
+        ("cd_edge = 0.80", "cd_edge = 0.80\nlinear = [0, 0, 0, 0, 500, 0]", r"drag.linear: 500 in pitch stops .* at most 4\.4$"),
         ("cd_face = 1.05\ncd_edge = 0.80", "cd_face = 1.0\ncd_edge = 0.25", "must be above cd_face / 4, here 0.25"),
         ("[hull]\n", '[hull]\nmesh = "hull.stl"\n', r"odd.toml:\d+: hull.mesh: .*/hull.stl: there is no such mesh"),
         ('name = "modcube"', 'name = ""', r"odd.toml:2: name: '' cannot be the name of a file"),
