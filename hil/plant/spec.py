@@ -111,7 +111,10 @@ class SensorSpec:
     depth_walk: float = quantity(2e-4, unit="m/sqrt(s)", low=0, high=1, help="random walk of the depth bias (synthetic)")
     tag_rate_hz: float = quantity(60.0, unit="Hz", low=0.1, high=400, help="frame rate of the free-running tag cameras (paper)")
     tag_phase: float = quantity(1.0, low=0, high=1, help="share of the picture period within which the phase of a camera is drawn")
-    tag_delay_ms: float = quantity(40.0, unit="ms", low=0, high=500, help="delay from the picture to its CAN frames (synthetic)")
+    tag_delay_ms: float = quantity(
+        40.0, unit="ms", low=0, high=480,
+        help="delay from the picture to its CAN frames (synthetic); the firmware takes no picture that is older than 500 ms in its tick",
+    )
     tag_sigma_m: float = quantity(0.002, unit="m", low=0, high=1, help="tag position noise across the camera axis (synthetic)")
     tag_sigma_axis_m: float = quantity(0.004, unit="m", low=0, high=1, help="tag position noise along the camera axis (synthetic)")
     tag_sigma_deg: float = quantity(0.5, unit="deg", low=0, high=90, help="tag attitude noise, each axis (synthetic)")

@@ -12,14 +12,18 @@ import numpy as np
 import pytest
 
 from firmware_py.app.firmware import vehicles_of
+from firmware_py.bus.mapping import STALE_NS
+from firmware_py.core.history import WINDOW_NS
 from firmware_py.core.types import Action, Outputs, Request, Setpoint
+from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.schema import DescriptionError
+from firmware_py.description.schema import DescriptionError, limits_of
 from hil.bench import fleet_of, script_of
 from hil.campaign import identity
 from hil.dock_script import AFTERWARDS_NS, DockScript
 from hil.force_metrics import force_names
 from hil.metrics import DOCKING, SHOWN
+from hil.plant.spec import SensorSpec
 from hil.scenario import Scenario, Step, load_scenario, make_world
 from hil.scenario_files import scenario_names
 from hil.scenario_rules import metric_names
@@ -154,6 +158,7 @@ def load(tmp_path: Path) -> Load:
             *((f'"{kind}"\nmodule = 1', f"module: {kind} is not of one module") for kind in WHOLE_BUS),
         )),
         ("dock", "", '[[fault]]\nkind = "jets"\nvalue = 0.5\nmodule = 1', "fault[0].module: jets is not of one module, as of 1"),
+        ("hover", "", "[sensors]\ntag_delay_ms = 500", "sensors.tag_delay_ms: 500 is out of range; permitted: 0 to 480 ms"),
         ("hover", "settle_s = 15.0", "settle_s = 1.0", "1 s; the robot is armed after 1 s, and the task needs it armed; 1.1"),
         ("faults", "settle_s = 3.0", "settle_s = 0.0", "task.settle_s: 0 s; the robot is armed after 1 s"),
         ("mobius-4", "cell = [1, 1, 0]", "cell = [1, 0, 0]", ":35: modules 2 and 4 overlap in cell (1, 0, 0)"),
@@ -208,6 +213,11 @@ def test_fault_that_no_tick_meets_is_refused(load: Load, at_s: float, until_s: f
         return
     with pytest.raises(DescriptionError, match=r"^hover: fault\[0\], leak, from .* s is between two ticks, 10 ms apart; it"):
         make_world(scenario, 0, period_ns)
+
+
+def test_longest_delay_of_a_tag_leaves_it_young_enough_for_the_firmware_at_every_rate() -> None:
+    longest_period_ms = 1e3 / limits_of(Fleet, "rate_hz").low
+    assert limits_of(SensorSpec, "tag_delay_ms").high + longest_period_ms == 1e-6 * min(STALE_NS, WINDOW_NS)
 
 
 @pytest.fixture
