@@ -10,6 +10,7 @@ import socket
 import termios
 import threading
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from typing import Any, Protocol
 
 import serial
@@ -25,6 +26,8 @@ _NO_DEVICE = (errno.ENOENT, errno.ENODEV, errno.ENXIO)
 """Errors of a serial device that is not plugged in."""
 _RESOLVE_EVERY_S = 2.0
 """Interval between attempts to resolve the name of a host."""
+_ANSWER_S = 1.0
+"""How long the start waits for the address of a name. Without a network the resolver takes ten seconds and more to give up."""
 
 
 class LinkError(Exception):
@@ -357,7 +360,7 @@ def _serial_link(device: str, baud: int, put_off: Callable[[OSError], None]) -> 
 def _network_link(kind: str, host: str, port: int, put_off: Callable[[OSError], None]) -> Link:
     numeric = ""
     try:
-        numeric = socket.gethostbyname(host)
+        numeric = _address_of(host)
         return _open_network(kind, numeric, port)
     except OSError as error:
         is_late = error.errno == errno.EADDRNOTAVAIL if numeric else _is_name(host)
@@ -370,6 +373,23 @@ def _network_link(kind: str, host: str, port: int, put_off: Callable[[OSError], 
 def _open_network(kind: str, host: str, port: int) -> Link:
     """Opens a network link at a numeric address. Raises OSError."""
     return TcpLink((host, port)) if kind == "tcpin" else UdpLink((host, port), kind == "udpin")
+
+
+def _address_of(host: str) -> str:
+    """Returns the numeric address of a host. Raises OSError, also when there is no answer within _ANSWER_S."""
+    answer: Future[str] = Future()
+
+    def ask() -> None:
+        try:
+            answer.set_result(socket.gethostbyname(host))
+        except (OSError, ValueError) as error:
+            answer.set_exception(error)
+
+    threading.Thread(target=ask, name="resolver", daemon=True).start()
+    try:
+        return answer.result(_ANSWER_S)
+    except TimeoutError:
+        raise socket.gaierror(socket.EAI_AGAIN, "no name server answers") from None
 
 
 def _is_name(host: str) -> bool:

@@ -217,17 +217,23 @@ def test_late_link_whose_port_is_taken_meanwhile_is_counted_as_failing(monkeypat
             assert list(links.receive()) == [] and links.counts == {"receive": 1}
 
 
-def test_station_whose_name_nobody_knows_yet_is_spoken_to_when_somebody_does_and_holds_up_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The resolver may take half a minute to say that the network is down: it is not asked in the thread that hears stops."""
+@pytest.mark.parametrize(("answers", "reason"), [(True, "Temporary failure in name resolution"), (False, "no name server answers")])
+def test_station_whose_name_nobody_knows_yet_is_spoken_to_when_somebody_does_and_holds_up_nothing(
+    answers: bool, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The resolver may take half a minute to say that the network is down: neither the start nor who hears stops waits for it."""
     asked, is_up, ours = [], threading.Event(), threading.current_thread()
 
     def resolve(name: str) -> str:
+        assert threading.current_thread() is not ours
         asked.append(name)
-        if threading.current_thread() is ours:
-            raise socket.gaierror(socket.EAI_AGAIN, "Temporary failure in name resolution")
+        if answers and len(asked) == 1:
+            raise socket.gaierror(socket.EAI_AGAIN, reason)
         assert is_up.wait(PATIENCE_S)
         return "127.0.0.1"
 
+    if not answers:
+        monkeypatch.setattr("firmware_py.ground.transport._ANSWER_S", 0.0)
     monkeypatch.setattr("firmware_py.ground.transport.socket.gethostbyname", resolve)
     monkeypatch.setattr("firmware_py.ground.transport._RESOLVE_EVERY_S", 0.0)
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as station:
@@ -235,7 +241,7 @@ def test_station_whose_name_nobody_knows_yet_is_spoken_to_when_somebody_does_and
         station.setblocking(False)
         address = f"udpout:station.local:{station.getsockname()[1]}"
         with closing(Links([address])) as links:
-            assert links.warnings == [f"link {address}: not there yet: Temporary failure in name resolution; it is opened when it is there"]
+            assert links.warnings == [f"link {address}: not there yet: {reason}; it is opened when it is there"]
             end, got = time.monotonic() + PATIENCE_S, b""
             while not got and time.monotonic() < end:
                 links.send(None, b"telemetry")
