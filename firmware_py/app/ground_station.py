@@ -103,7 +103,7 @@ class GroundSide:
         unix_now_ns: the time of day, for signing.
         priority: SCHED_FIFO priority of the thread, for use with a real-time loop; 0: an ordinary thread.
         started: parameters before the stored ones were laid over them; None: the firmware's.
-        say: receives one line about each link that is not there yet, and about the first error, in its own thread.
+        say: receives one line about each link that is not there yet, another once it is, and one about the first error, in its own thread.
     """
 
     def __init__(
@@ -245,6 +245,8 @@ class GroundSide:
             time.sleep(self._rest_s())
             for part in self._parts():
                 self._try(part, teller)
+            while self.links.opened:
+                teller.say(self.links.opened.pop(0))
         teller.close()
 
     def _try(self, act: Callable[[], None], teller: Teller) -> None:

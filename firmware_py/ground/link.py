@@ -58,6 +58,8 @@ class Links:
         """Opens every address, later if it is not there yet. Raises LinkError, and then leaves no link open."""
         self.warnings: list[str] = []
         """One line for each address that is not there yet."""
+        self.opened: list[str] = []
+        """One line for each of these once it is there."""
         self.counts: Counter[str] = Counter()
         self.channels: dict[int, Channel] = {}
         self.links: list[Link] = []
@@ -65,10 +67,14 @@ class Links:
         self._by_peer: dict[tuple[int, Any], int] = {}
         self._next = 0
         self._gone: list[int] = []
+        self._late: dict[int, str] = {}
+        """Address of each link, by its index, that is not there yet."""
         try:
             for address in addresses:
                 self.links.append(open_link(address.removesuffix(TRUSTED), self.warnings.append))
                 self._trusted.append(address.endswith(TRUSTED))
+                if not self.links[-1].is_open:
+                    self._late[len(self._trusted) - 1] = address.removesuffix(TRUSTED)
         except LinkError:
             self.close()
             raise
@@ -84,6 +90,8 @@ class Links:
             except OSError:
                 self.counts["receive"] += 1
                 continue
+            if link.is_open and index in self._late:
+                self.opened.append(f"link {self._late.pop(index)}: is there now")
             if not link.datagram:
                 self._sync_peers(index, link.peers())
             for peer, data in got:

@@ -39,6 +39,11 @@ class Link(Protocol):
 
     datagram: bool
 
+    @property
+    def is_open(self) -> bool:
+        """Whether its device or network is there; as long as it is not, `receive` tries to open it."""
+        ...
+
     def receive(self) -> list[tuple[Any, bytes]]:
         """Returns the received data, each piece with its peer."""
         ...
@@ -67,6 +72,7 @@ class UdpLink:
     """
 
     datagram = True
+    is_open = True
 
     def __init__(self, address: tuple[str, int], listen: bool) -> None:
         self._to = None if listen else _who_answers(address)
@@ -132,6 +138,7 @@ class TcpLink:
     """tcpin: every connected client is a peer."""
 
     datagram = False
+    is_open = True
 
     def __init__(self, address: tuple[str, int]) -> None:
         self._server = socket.create_server(address)
@@ -209,6 +216,10 @@ class LateLink:
         if not resolved:
             threading.Thread(target=self._resolve, args=(host,), name="resolver", daemon=True).start()
 
+    @property
+    def is_open(self) -> bool:
+        return self._link is not None
+
     def _resolve(self, name: str) -> None:
         while not self._host and not self._closed.wait(_RESOLVE_EVERY_S):
             with contextlib.suppress(OSError):
@@ -266,6 +277,10 @@ class SerialLink:
             if isinstance(error.__context__, termios.error):  # SerialException keeps neither its errno nor its text separately
                 raise OSError(*error.__context__.args) from None
             raise
+
+    @property
+    def is_open(self) -> bool:
+        return self._serial is not None
 
     def _is_plugged(self) -> bool:
         """Whether the device is open; opens it when it is there."""

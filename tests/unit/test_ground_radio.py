@@ -153,7 +153,7 @@ def test_frame_with_a_flag_that_nobody_here_knows_is_not_believed() -> None:
 class SlowLink:
     """A radio that carries a limited number of bytes a tick."""
 
-    datagram = False
+    datagram, is_open = False, True
 
     def __init__(self, bytes_per_tick: float) -> None:
         self.bytes_per_tick, self.room, self.frames = bytes_per_tick, 0.0, list[bytes]()
@@ -291,9 +291,15 @@ def test_radio_that_is_not_plugged_in_yet_is_warned_of_and_taken_up_when_it_is(t
         assert links.warnings == [f"link {name},115200: not there yet: No such file or directory; it is opened when it is there"]
         links.send(None, b"to nobody")
         links.flush()
-        assert list(links.receive()) == []
+        assert list(links.receive()) == [] and not links.opened
         radio = Radio(name)
         _talks(links, radio)
+        radio.pull()
+        links.send(None, b"to nobody")
+        links.flush()
+        radio = Radio(name)
+        _talks(links, radio)
+        assert links.opened == [f"link {name},115200: is there now"]
     radio.pull()
 
 

@@ -1,6 +1,7 @@
 """The ground side beside the tick: who is trusted, what is handed over in time, and failures that do no harm."""
 
 import os
+import pty
 import socket
 import struct
 import threading
@@ -218,10 +219,15 @@ def test_ground_side_in_which_something_fails_says_so_once_and_goes_on_to_hear_a
     assert type(side.error).__name__ in said.get_nowait() and said.empty()
 
 
-def test_link_that_is_not_there_yet_is_said_and_keeps_no_other_from_its_work(tmp_path: Path) -> None:
+def test_link_that_is_not_there_yet_is_said_and_keeps_no_other_from_its_work_and_is_said_once_it_is(tmp_path: Path) -> None:
     said: Queue[str] = Queue()
-    config = GroundConfig(links=(f"{tmp_path}/radio,57600", "udpin:127.0.0.1:0"))
+    config, (ours, theirs) = GroundConfig(links=(f"{tmp_path}/radio,57600", "udpin:127.0.0.1:0")), pty.openpty()
     with GroundSide(config, firmware_of(), ThreadPoolExecutor(1), say=said.put) as side:
         warning = said.get(timeout=PATIENCE_S)
+        (tmp_path / "radio").symlink_to(os.ttyname(theirs))
+        assert said.get(timeout=PATIENCE_S) == f"link {tmp_path}/radio,57600: is there now"
         assert side.error is None
+    assert said.empty()
     assert warning == f"warning: link {tmp_path}/radio,57600: not there yet: No such file or directory; it is opened when it is there"
+    os.close(ours)
+    os.close(theirs)
