@@ -266,7 +266,7 @@ def _in_faces(scenario: Scenario) -> Iterator[Mistake]:
         if step.do != "dock" or not {step.module, step.target_module} <= vehicles.keys():
             continue
         faces = FACE_NAMES.index(step.face), FACE_NAMES.index(step.target_face)
-        if why := face_mismatch(vehicles[step.module], faces[0], vehicles[step.target_module], faces[1]):
+        if why := face_mismatch(vehicles[step.module].faces, faces[0], vehicles[step.target_module].faces, faces[1]):
             yield ("step", i, "face"), f"module {step.module} cannot dock to module {step.target_module}: {why}"
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.transitions import MODES
 from firmware_py.core.types import FACES, WARNING, Action, DockRequest, Event, Mode, Request, Setpoint, Sticks
+from firmware_py.description.vehicle import face_mismatch
 
 QUARTERS = 4
 FARTHEST = 1e6
@@ -179,17 +180,18 @@ def against_request(request: Request, bodies: Mapping[int, Body]) -> str:
 
 
 def _against_faces(action: Action, dock: DockRequest, body: int, bodies: Mapping[int, Body]) -> str:
-    """Reason why two modules can neither dock nor undock, regardless of their faces; empty if they can."""
-    modules = {module for each in bodies.values() for module in each.modules}
-    unknown = {dock.module, dock.target_module} - modules
+    """Reason why two modules can neither dock nor undock; empty if they can. For an undock it does not matter which faces it names."""
+    faces = {module: kinds for each in bodies.values() for module, kinds in zip(each.modules, each.faces, strict=True)}
+    unknown = {dock.module, dock.target_module} - faces.keys()
     if unknown:
-        return f"there is no module {min(unknown)}; there are {_listed(modules)}"
+        return f"there is no module {min(unknown)}; there are {_listed(faces)}"
     if dock.module not in bodies[body].modules:
         return f"module {dock.module} is not of body {body}"
     together = dock.target_module in bodies[body].modules
     if together == (action == Action.DOCK):
         return f"modules {dock.module} and {dock.target_module} are {'already' if together else 'not'} of one body"
-    return ""
+    why = "" if together else face_mismatch(faces[dock.module], dock.face, faces[dock.target_module], dock.target_face)
+    return why and f"module {dock.module} cannot dock to module {dock.target_module}: {why}"
 
 
 def _listed(numbers: Iterable[int]) -> str:

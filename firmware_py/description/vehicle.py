@@ -246,9 +246,9 @@ class Vehicle:
         return (4.0 * self.drag.cd_edge - self.drag.cd_face) / 3.0
 
 
-def face_mismatch(of: Vehicle, face: int, to: Vehicle, target_face: int) -> str:
-    """Why a face of one vehicle cannot dock to a face of another, in words; empty where it can."""
-    kinds = of.faces[face], to.faces[target_face]
+def face_mismatch(faces: str, face: int, target_faces: str, target_face: int) -> str:
+    """Why a face of one vehicle cannot dock to a face of another, in words; empty where it can. Takes each vehicle's `faces`."""
+    kinds = faces[face], target_faces[target_face]
     if set(kinds) == {"P", "D"}:
         return ""
     return f"{FACE_NAMES[face]} is {FACE_KINDS[kinds[0]]} and {FACE_NAMES[target_face]} {FACE_KINDS[kinds[1]]}; a probe docks to a drogue"

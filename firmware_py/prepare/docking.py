@@ -31,8 +31,8 @@ def plan_dock(request: DockRequest, active: Body, target: Body, vehicles: Sequen
         DescriptionError: the two faces are not a probe and a drogue, the bodies would overlap, or elsewhere a probe would meet no drogue;
             names the modules.
     """
-    active_vehicle, target_vehicle = vehicles[request.module], vehicles[request.target_module]
-    if why := face_mismatch(active_vehicle, request.face, target_vehicle, request.target_face):
+    faces, target_faces = vehicles[request.module].faces, vehicles[request.target_module].faces
+    if why := face_mismatch(faces, request.face, target_faces, request.target_face):
         raise DescriptionError(f"module {request.module} cannot dock to module {request.target_module}: {why}")
     turn_t = _turn_of(target, request.target_module)
     normal = _rounded(turn_t @ FACE_NORMALS[request.target_face])

@@ -312,7 +312,7 @@ def test_refused_dock_does_not_end_the_one_that_was_asked_for_after_it() -> None
     tank.states[1][1] = 0.6
     tank.run(2.0)
     tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
-    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 2)))  # a probe against a probe
+    tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))  # through the target
     tank.run(0.15, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     outputs = tank.run(1.0)
     assert tank.when("dock refused") < tank.when("docking module 1 to 0")

@@ -131,6 +131,10 @@ def test_body_that_is_not_there_is_named_with_those_that_are() -> None:
         (Action.DOCK, 1, DOCK._replace(module=5), "there is no module 5; there are 0, 1"),
         (Action.DOCK, 0, DOCK, "module 1 is not of body 0"),
         (Action.DOCK, 1, DOCK._replace(target_module=1), "modules 1 and 1 are already of one body"),
+        (
+            Action.DOCK, 1, DOCK._replace(face=0),
+            "module 1 cannot dock to module 0: +x is a probe and +x a probe; a probe docks to a drogue",
+        ),
         (Action.UNDOCK, 1, DOCK, "modules 1 and 0 are not of one body"),
     ],
 )
@@ -230,7 +234,7 @@ def test_place_with_a_hole_in_it_does_not_poison_the_set_point() -> None:
 
 
 def test_dock_that_cannot_be_prepared_leaves_the_body_holding_its_place() -> None:
-    """Probe against probe is found only in preparation, after the mode has changed."""
+    """That another pair of faces would be probe against probe is found only in preparation, after the mode has changed."""
     from firmware_py.core.docking_decisions import Prepared
 
     tank = Tank([single(0), single(1)])
