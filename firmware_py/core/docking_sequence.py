@@ -17,7 +17,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.docking_detector import PairStatus
 from firmware_py.core.docking_plan import DockPlan, module_in, pose_of
 from firmware_py.core.rotations import conjugate, difference, exp, multiply, normalise, rotate, rotate_back
-from firmware_py.core.setpoint import Wish
+from firmware_py.core.setpoint import REST, Wish
 from firmware_py.core.types import RELAY_OFF, RELAY_PULL, RELAY_PUSH, Estimate, Setpoint
 from firmware_py.description.parameters import Docking
 
@@ -27,6 +27,8 @@ TURN_RAD = 0.03
 """Angle by which the active module is turned about the docking axis after a jam, in alternating directions."""
 RETREAT_M_S = 0.04
 """Rate at which the gap grows when backing off."""
+SURE_NS = 1_000_000_000
+"""How long a dock waits at its beginning for pictures that tell the places of both bodies well enough; an undock spoils them for 0.3 s."""
 CONE = 1.5
 """The approach waits while the lateral or the angle error exceeds this multiple of its alignment limit."""
 
@@ -126,9 +128,12 @@ class DockingSequence:
 
     def step(self, time_ns: int, active: Estimate, target: Estimate, status: PairStatus, waits: Wish | None = None) -> SequenceOutputs:
         """Advances the sequence by one tick. `waits`: given while another body blocks the way; the active body glides by it instead until
-        it stands before the target's face. If it leads to a place, to make room, the body also retreats from before the face.
+        it stands before the target's face. If it leads to a place, to make room, the body also retreats from before the face. At its
+        beginning, the body rests while the places of both are not known well enough.
         """
-        delays = waits is not None and self._p.approach == "straight"  # its line is drawn once, to where the target will be
+        unsure = self.stage == Stage.PRE_APPROACH and self._sigma_m(active, target) > self._p.sigma_m
+        delays = unsure or (waits is not None and self._p.approach == "straight")  # its line is drawn once, to where the target will be
+        waits = REST if waits is None and unsure else waits
         meets = None if self._under_way or delays else self._set_off(active, target)
         errors = self.errors(active, target)
         passed_ns, self._last_ns = time_ns - self._last_ns, time_ns
@@ -195,10 +200,11 @@ class DockingSequence:
         if status.docked and TABLE[self.stage].relay == RELAY_PULL:  # while the magnets push, faces that are still near are not docked
             self._enter(Stage.DOCKED, time_ns)
             return
-        sigma = float(np.sqrt(np.max(active.sigma_p**2 + target.sigma_p**2)))
+        sigma, placed = self._sigma_m(active, target), active.placed and target.placed
         if sigma > self._p.sigma_m and self.stage not in (Stage.RELEASE, Stage.BACK_OFF):
-            known = f"relative sigma {sigma * 1e3:.1f} mm, {self._p.sigma_m * 1e3:.1f} permitted"
-            self.abort(time_ns, known if active.placed and target.placed else "no tag has told yet where one of the two bodies is")
+            if self.stage != Stage.PRE_APPROACH or not placed or time_ns - self._entered_ns > SURE_NS:
+                known = f"relative sigma {sigma * 1e3:.1f} mm, {self._p.sigma_m * 1e3:.1f} permitted"
+                self.abort(time_ns, known if placed else "no tag has told yet where one of the two bodies is")
             return
         row = TABLE[self.stage]
         if self._waited_ns > self._p.timeout_s * 1e9:
@@ -207,6 +213,10 @@ class DockingSequence:
             self._time_out(time_ns, status)
         elif row.on_done is not None and not waits and self._is_done(time_ns, errors, status):
             self._enter(row.on_done, time_ns)  # not while it waits: it is still on its way then, even where it passes the end
+
+    def _sigma_m(self, active: Estimate, target: Estimate) -> float:
+        """Standard deviation of the place of one body relative to the other, m, along the worst axis."""
+        return float(np.sqrt(np.max(active.sigma_p**2 + target.sigma_p**2)))
 
     def _is_done(self, time_ns: int, errors: Errors, status: PairStatus) -> bool:
         """Whether the stage has reached its aim. That of VERIFY is a dock, which `_decide` sees first; RELEASE lasts for its time."""

@@ -1,4 +1,4 @@
-"""The docking sequence alone: a dock that begins near ends like any other, and a dock that is aborted at once moves no body."""
+"""The docking sequence alone: a dock that begins near ends like any other, and one that is aborted before it sets off moves no body."""
 
 import math
 
@@ -81,11 +81,27 @@ def test_target_that_is_not_free_is_not_moved_and_the_line_goes_all_the_way() ->
     assert sequence.errors(estimate(p_a), estimate(p_t)).gap_m == pytest.approx(0.0, abs=1e-3)
 
 
-def test_dock_that_is_aborted_at_once_moves_nobody() -> None:
-    sequence, p_t, p_a = begin(Docking(), 0.5)
-    steering = sequence.step(TICK_NS, estimate(p_a, sigma_m=0.02), estimate(p_t), NEITHER)
-    assert sequence.stage == Stage.ABORTED
+@pytest.mark.parametrize("parameters", [Docking(), Docking(approach="straight")], ids=["staged", "straight"])
+def test_dock_between_places_that_are_not_known_well_enough_waits_for_a_second_and_moves_nobody(parameters: Docking) -> None:
+    sequence, p_t, p_a = begin(parameters, 0.5)
+    for tick in range(1, 101):
+        steering = sequence.step(tick * TICK_NS, estimate(p_a, sigma_m=0.02), estimate(p_t), NEITHER)
+        assert (sequence.stage, steering.active, steering.meets) == (Stage.PRE_APPROACH, REST, None)
+    steering = sequence.step(101 * TICK_NS, estimate(p_a, sigma_m=0.02), estimate(p_t), NEITHER)
+    assert sequence.stage == Stage.ABORTED and sequence.reason.startswith("relative sigma")
     assert steering.meets is None
+
+
+@pytest.mark.parametrize("parameters", [Docking(), Docking(approach="straight")], ids=["staged", "straight"])
+def test_dock_sets_off_once_both_places_are_known_well_enough(parameters: Docking) -> None:
+    sequence, p_t, p_a = begin(parameters, 0.5)
+    sequence.step(TICK_NS, estimate(p_a, sigma_m=0.02), estimate(p_t + 0.1), NEITHER)
+    left = Docking().standoff_m if parameters.approach == "staged" else 0.0
+    meets = sequence.step(2 * TICK_NS, estimate(p_a), estimate(p_t), NEITHER).meets
+    np.testing.assert_allclose(meets, [0.5 * (0.5 - left), 0.0, 0.0], atol=1e-12)
+    steering = sequence.step(3 * TICK_NS, estimate(p_a, sigma_m=0.02), estimate(p_t), NEITHER)
+    rests = sequence.stage == Stage.PRE_APPROACH and steering.active == REST
+    assert rests if parameters.approach == "staged" else sequence.stage == Stage.ABORTED
 
 
 # ---------------------------------------------------------------- the way to the stand-off

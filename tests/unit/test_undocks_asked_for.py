@@ -62,6 +62,18 @@ def test_undock_that_was_called_off_before_its_plan_came_does_not_part_a_body_th
     assert tank.shape == [(0, 1), (2,)]
 
 
+def test_module_that_has_just_been_undocked_may_dock_again_at_once() -> None:
+    """Regression: the dock was given up, because two bodies that have just parted need a few pictures to know their places again."""
+    tank = FaultyTank([(0, 0, 0), (1, 0, 0)])
+    tank.fly()
+    tank.run(0.01, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    while len(tank.shape) == 1:
+        tank.run(0.01)
+    outputs = tank.run(1.5, Request(Action.DOCK, 1, DockRequest(1, 1, 0, 0)))
+    assert outputs.records[1].mode == Mode.DOCK and len(outputs.docks) == 1
+    assert not any("ABORTED" in text for _, text in tank.event_log)
+
+
 @pytest.mark.parametrize(("ahead", "behind", "glides"), [(False, False, 1), (True, False, 0), (False, True, 1), (True, True, None)])
 def test_what_is_undocked_glides_to_no_third_body(ahead: bool, behind: bool, glides: int | None) -> None:
     """When a chain of three was taken apart, the middle one once glided away from the last and pressed against the first."""
