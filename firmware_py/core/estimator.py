@@ -184,7 +184,7 @@ class Estimator:
 
     def _take(self, pose: BodyPose) -> None:
         """Starts from a tag picture, or advances the anchor to it and fuses it there; refuses one from before the anchor."""
-        if not observation.are_finite(pose.p_wt, pose.q_wb):
+        if not (observation.are_finite(pose.p_wt, pose.q_wb) and pose.q_wb.any()):
             self._rejected += 1
         elif not self._accepted:
             self._start(pose)

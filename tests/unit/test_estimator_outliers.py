@@ -99,6 +99,17 @@ def test_robot_that_was_seen_askew_is_upright_at_once_when_it_is_seen_well(body:
         assert_rests(robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - PERIOD))))
 
 
+@pytest.mark.parametrize("ticks", [1, 100], ids=["before the first tag", "later"])
+def test_tag_whose_attitude_is_none_is_refused(body: Body, ticks: int) -> None:
+    """No frame can hold such a quaternion; a filter that started from one would divide by zero."""
+    robot = Robot(body)
+    robot.rest(ticks)
+    for _ in range(3):
+        estimate = robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - PERIOD)._replace(q_wb=np.zeros(4))))
+    assert estimate.rejected == 3
+    assert_rests(robot.rest(5 * READY_AFTER), tolerance_m=0.02)
+
+
 @pytest.mark.parametrize("speed", [1e3, -1e160])
 def test_filter_that_believes_a_speed_that_no_robot_has_begins_anew(body: Body, speed: float) -> None:
     """A false depth once made it believe 1e160 m/s."""
