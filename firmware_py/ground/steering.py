@@ -32,6 +32,9 @@ _FORCES, _NO_ACCELERATION = 0x200, 7 << _ACCELERATION_BIT
 """Mask of the bit by which the acceleration fields are forces, N; mask by which all three of them are left out."""
 _NO_ATTITUDE = 0x80
 """ATTITUDE_TARGET_TYPEMASK: the attitude is left out."""
+_BACK_M = 0.1
+"""Largest distance, per axis, between the body and a place that a velocity leads back to it. A body that was held back, as at the fence,
+would else stand until the place has come back by `core.setpoint.LEASH_M`. A body that follows is nearer to its place."""
 _HAS_PITCH, _HAS_ROLL = 1, 2
 """Bits of `enabled_extensions` in MANUAL_CONTROL: the axes s and t are sent."""
 _RC_IGNORED = 0xFFFF
@@ -248,7 +251,7 @@ class Steering:
         start, elapsed_s = self._before(time_ns)
         before = now if start is None else start.p_wb
         at = self._system.subject.record.estimate.p_wb
-        moved = before if velocity is None else leashed(before, at) + velocity * elapsed_s
+        moved = before if velocity is None else _reined_in(before, at, velocity) + velocity * elapsed_s
         return np.asarray(moved if position is None else np.where(np.isnan(position), moved, position))
 
     def _attitude(self, now: np.ndarray, yaw: float | None, rate: float, time_ns: int) -> np.ndarray:
@@ -307,6 +310,12 @@ def _vector(message: Message, names: Sequence[str], left_out: int, instead: floa
         return None
     given = (message[name] if math.isfinite(message[name]) else math.inf for name in names)
     return np.array([instead if left_out >> axis & 1 else value for axis, value in enumerate(given)])
+
+
+def _reined_in(place: np.ndarray, p_wb: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Returns the place (3,) on its leash from the body at `p_wb` (3,): a short leash on axes on which `velocity` leads it back there."""
+    leads_back = velocity * (place - p_wb) < 0.0
+    return np.where(leads_back, np.clip(place, p_wb - _BACK_M, p_wb + _BACK_M), leashed(place, p_wb))
 
 
 def _turned_where_given(p_b: np.ndarray, turn: np.ndarray) -> np.ndarray:

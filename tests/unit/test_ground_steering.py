@@ -170,6 +170,16 @@ def test_velocity_of_zero_stops_a_body_that_could_not_follow(world: World, clien
     assert 0.5 < stop.p_wb[0] - world.robot.p_wb[0][0] <= 1.0 + 1e-6
 
 
+def test_velocity_back_is_obeyed_at_once_by_a_body_that_could_not_follow(world: World, client: Client) -> None:
+    """A robot that was steered against the fence stood there for as long as its place took to come back by a metre."""
+    fly_by_velocity(world, client)
+    for vx in (*[0.2] * 60, -0.1):
+        send_target(client, 0xDC7, vx=vx, vy=0.2)
+        world.run(10)
+    ahead = [r.argument for r in world.robot.asked if r.action == Action.SET_POINT][-1].p_wb - world.robot.p_wb[0]
+    assert ahead[0] == pytest.approx(0.09, abs=0.01) and ahead[1] > 0.9
+
+
 def test_robot_that_is_held_while_a_rate_streams_is_turned_that_way_and_never_back(world: World, client: Client) -> None:
     fly_by_velocity(world, client)
     for _ in range(100):
