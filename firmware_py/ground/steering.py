@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from firmware_py.core.requests import is_setpoint
 from firmware_py.core.rotations import from_euler, heading, multiply, normalise, rotate, to_euler
 from firmware_py.core.setpoint import leashed, leashed_turn
 from firmware_py.core.types import NOTICE, WARNING, Action, DockRequest, Mode, Setpoint, Sticks
@@ -286,8 +287,8 @@ class Steering:
         self._stream(Setpoint(p_wb, np.asarray(normalise(q)), zero, zero, zero, zero), arrival)
 
     def _stream(self, setpoint: Setpoint, arrival: Arrival) -> None:
-        """Requests `setpoint` if its sender has control of the set-points."""
-        if self._arbiter.claim(arrival):
+        """Requests `setpoint` if its sender has control of the set-points; ignores one that the core would refuse, each time in a text."""
+        if is_setpoint(setpoint) and self._arbiter.claim(arrival):
             self._setpoint, self._setpoint_ns = setpoint, arrival.time_ns
             self._system.ask(Action.SET_POINT, setpoint)
 

@@ -197,6 +197,16 @@ def test_setpoints_that_are_no_numbers_are_ignored(world: World, client: Client)
     assert not world.robot.asked
 
 
+@pytest.mark.parametrize("values", [{"x": 5.3e6}, {"vx": 3e38}, {"yaw_rate": -1e30}, {"afz": 1e9}])
+def test_set_points_beyond_all_sense_are_ignored_and_do_not_lead_into_guided_mode(
+    world: World, client: Client, values: dict[str, float]
+) -> None:
+    """Each was refused in a text of its own, at the rate of the stream, and guided mode was granted without a set-point."""
+    send_target(client, 0x400, **values)
+    assert ask(world, client, 176, 1, 6) == mavlink.MAV_RESULT_TEMPORARILY_REJECTED
+    assert not world.robot.asked
+
+
 @pytest.mark.parametrize(("mask", "followed"), [(0xC38, True), (0xC38 | 0x200, False), (0xDF8 | 0x200, True)])
 def test_force_is_not_taken_for_an_acceleration(world: World, client: Client, mask: int, followed: bool) -> None:
     send_target(client, mask, x=0.1)
