@@ -352,8 +352,11 @@ class MissionFlight:
         flight, self._flight, self._plan_at_tick = self._flight, None, None
         self.jobs.clear()
         if flight is not None and flight.of_mission and not flight.replaced:
-            self._system.subject.progress.state = state
-            self._remaining_legs = flight.legs[flight.reached :] or flight.legs[-1:]
+            s = self._system.subject
+            t_s = 0.0 if flight.started_ns is None else (s.picture.time_ns - flight.started_ns) / NS_PER_S
+            self._remaining_legs, s.progress.state = flight.left(t_s), state
+            if state == PAUSED:
+                s.progress.current = self._remaining_legs[0].sequence
 
     @property
     def _first(self) -> int:

@@ -66,6 +66,12 @@ class Flight:
         """Whether the next leg counts as late."""
         return math.isinf(self.late_s)
 
+    def left(self, t_s: float) -> tuple[Leg, ...]:
+        """Returns the legs left to fly at `t_s` from the start, at least the last: with the one where the body holds, those not reached."""
+        last = self.reached - 1
+        holds = last >= 0 and t_s < self.arrivals_s[last] + self.legs[last].hold_s
+        return self.legs[last if holds else self.reached :] or self.legs[-1:]
+
     def reach(self, t_s: float) -> None:
         """Counts the next leg as reached at `t_s` from the start."""
         self.reached_s, self.late_s = t_s, t_s - self.arrivals_s[self.reached]

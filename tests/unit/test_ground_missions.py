@@ -93,6 +93,18 @@ def test_mission_that_is_paused_in_its_last_hold_goes_on_with_that_alone(world: 
     assert continued(world, client) == [1]
 
 
+@pytest.mark.parametrize(("seconds", "left"), [(9, [0, 1, 2]), (11, [0, 1, 2]), (14, [0, 1, 2]), (16, [1, 2])])
+def test_mission_that_is_paused_in_a_hold_goes_on_with_that_hold(world: World, client: Client, seconds: int, left: list[int]) -> None:
+    """As on an ArduSub: what the robot was to look at from there, it has not yet seen."""
+    upload(world, client, [item(0, PLACES[0], p=(5, 0, 0, NAN)), item(1, PLACES[1]), item(2, PLACES[2])])
+    fly(world, client)
+    world.run(100 * seconds)
+    client.command(193, 0)
+    world.run(120)
+    assert client.last("MISSION_CURRENT").seq == left[0]
+    assert continued(world, client) == left
+
+
 @pytest.mark.parametrize("index", [2, 0, -1])
 def test_client_that_sets_the_current_item_hears_at_once_which_it_is(world: World, client: Client, index: int) -> None:
     """Also on a link where nothing streams: clients take this message for the answer."""
