@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -80,7 +80,7 @@ class ModulePicture:
 class Picture:
     """State of the fleet after the last tick."""
 
-    def __init__(self, modules: int, supervision: Supervision) -> None:
+    def __init__(self, modules: int, supervision: Callable[[], Supervision]) -> None:
         self._supervision = supervision
         self.modules = [ModulePicture() for _ in range(modules)]
         self.records: dict[int, BodyRecord] = {}
@@ -162,7 +162,7 @@ class Picture:
         record = self.records.get(body)
         if record is None or not record.estimate.ready:
             return False
-        return record.estimate.tag_age_ns <= self._supervision.tag_fresh_ms * 1e6
+        return record.estimate.tag_age_ns <= self._supervision().tag_fresh_ms * 1e6
 
     def distance(self, body: int, place: np.ndarray) -> float:
         """Distance between the body's estimate and a place (3,) in the world, m; NaN without a pose. Passive axes do not count: buoyancy

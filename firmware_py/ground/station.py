@@ -123,7 +123,7 @@ class GroundStation:
         self.signing = signing if signing is not None else Signing()
         self.store = ParameterStore(parameters, config.parameter_file)
         self.counts: Counter[str] = Counter()
-        self.picture = Picture(len(fleet.module), self.store.values.supervision)
+        self.picture = Picture(len(fleet.module), lambda: self.store.values.supervision)
         self.watch = Watch()
         self._dialect = load_dialect()
         self._busy: set[int] = set()

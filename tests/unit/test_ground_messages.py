@@ -155,7 +155,7 @@ def test_first_pose_is_no_restart() -> None:
 @pytest.mark.parametrize(("jump_m", "counted"), [(0.0, 0), (1.0, 1)])
 def test_estimate_that_is_thrown_away_for_what_tags_say_is_counted(jump_m: float, counted: int) -> None:
     pipeline = Pipeline([assemble_vehicle(load_vehicle("modcube"))], Parameters(), PERIOD_NS)
-    picture = Picture(1, Parameters().supervision)
+    picture = Picture(1, lambda: Parameters().supervision)
     for tick in range(1, 300):
         inputs = resting(tick, [])
         tag = inputs.modules[0].tags[0]
@@ -189,6 +189,9 @@ def test_system_status_tells_of_health_and_of_readiness_to_arm(world: World, cli
     world.robot.tag_age_ns = 2_000_000_000
     world.run(100)
     assert not client.last("SYS_STATUS").onboard_control_sensors_health & (vision | prearm)
+    client.send("PARAM_SET", 1, 1, b"TAG_FRESH_MS", 3000.0, 9)
+    world.run(100)
+    assert client.last("SYS_STATUS").onboard_control_sensors_health & vision, "as old as arming permits from now on"
 
 
 def test_heartbeat_tells_at_once_of_another_mode_of_arming_and_of_an_emergency_stop(world: World, client: Client) -> None:
