@@ -219,7 +219,8 @@ class CommandService:
             return self._accept_or_refuse("it names no place on the earth", "reposition", DENIED)
         if self._system.is_ambiguous_broadcast(command.arrival):
             return self._accept_or_refuse("it is for all, and there are several bodies", "reposition", DENIED)
-        reason = self._missions.go_to(latitude, longitude, altitude, command.parameters[3], command.get(1))
+        yaw = command.parameters[3] if self._system.subject.identity.waypoints_turn else math.nan
+        reason = self._missions.go_to(latitude, longitude, altitude, yaw, command.get(1))
         return self._accept_or_refuse(reason, "reposition", TEMPORARILY_REJECTED)
 
     # ------------------------------------------------------------ safety, docking, thrusters

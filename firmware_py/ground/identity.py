@@ -37,7 +37,7 @@ class Identity:
         numbers: custom modes that stand for each mode; the first is reported.
         pairs: the second and third parameter of DO_SET_MODE are a main and a sub mode, as in PX4.
         mission_has_home: item 0 of a mission is the home position and is not flown, as in ArduPilot.
-        waypoints_turn: a place in a mission may have a heading. ArduSub ignores it, and its clients write 0, which is north.
+        waypoints_turn: a place in a mission, or to go to, may have a heading. ArduSub ignores it; its clients write 0, which is north.
         first_log: number of the oldest log. QGroundControl counts from 1 for ArduPilot alone.
         first_motor: number of the first motor in a motor test. ArduSub and its test clients count from 0.
         rest_percent: throttle of a motor test at which the motor stands still. ArduSub's throttle ranges from 0, full reverse, to 100 %.

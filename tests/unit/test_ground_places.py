@@ -7,6 +7,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.core.types import Mode
+from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.geodesy import Origin
 from firmware_py.ground.mission_flight import PlanJob
 from tests.unit.ground_missions import PLACES, fly, item, plan_of, upload
@@ -48,6 +49,19 @@ def test_reposition_is_as_fast_as_it_asks_for(world: World, client: Client, aske
     world.run(10)
     (job,) = world.station.jobs()
     assert job.legs[0].speed_m_s == pytest.approx(flown)
+
+
+@pytest.mark.parametrize(("identity", "yaw"), [("generic", 0.0), ("ardusub", None)])
+def test_heading_of_a_reposition_turns_the_robot_but_for_clients_of_an_ardusub(identity: str, yaw: float | None) -> None:
+    """MAVProxy's `guided` writes 0 there, for a way to circle that is meant for planes: the robot turned north."""
+    world = World(config=GroundConfig(identity=identity))
+    client = world.client()
+    client.command(400, 1)
+    world.run(3)
+    client.send("COMMAND_INT", 1, 1, 6, 192, 0, 0, -1, 1, 0, 0.0, 302084010, 1201614000, -0.4)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert job.legs[0].yaw == yaw
 
 
 def test_reposition_that_comes_again_because_its_answer_was_lost_flies_on(world: World, client: Client) -> None:
