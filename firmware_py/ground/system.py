@@ -16,6 +16,10 @@ _TEXT = 50
 """Characters of one STATUSTEXT."""
 _SELDOM_NS = 5 * NS_PER_S
 """Least time between two refusals in text: refused messages may stream in."""
+_AGAIN_NS = NS_PER_S
+"""Time within which a text is not said a second time in a row: texts go to every link and never wait, and a client may ask in a loop for
+what is refused.
+"""
 NEVER_WAITS = ("HEARTBEAT", "STATUSTEXT")
 """Messages sent even to busy channels: without HEARTBEAT clients lose the vehicle, and STATUSTEXT is sent only once."""
 _SEND_ON_CHANGE = ("HEARTBEAT", "MISSION_CURRENT")
@@ -61,6 +65,8 @@ class System:
     task_changes: int = 0
     """Number of TASK_CHANGING_ACTIONS requested so far: a change means that the body was given another task."""
     _text_number: int = 0
+    _last_text: tuple[str, int] = "", 0
+    """The text said last, and when."""
     _said: dict[str, Any] = field(default_factory=dict)
     """Last values of each message of `_SEND_ON_CHANGE`."""
     _refused_ns: int = -_SELDOM_NS
@@ -116,7 +122,11 @@ class System:
             self.outbox.send(channel, name, values)
 
     def say(self, severity: int, text: str) -> None:
-        """Broadcasts a STATUSTEXT; long texts are sent in chunks."""
+        """Broadcasts a STATUSTEXT; long texts are sent in chunks. Leaves out one that was said just before."""
+        now_ns = self.subject.picture.time_ns
+        if text == self._last_text[0] and now_ns - self._last_text[1] < _AGAIN_NS:
+            return
+        self._last_text = text, now_ns
         pieces = [text[i : i + _TEXT] for i in range(0, len(text), _TEXT)] or [""]
         self._text_number = self._text_number % 0xFFFF + 1
         number = self._text_number if len(pieces) > 1 else 0

@@ -232,6 +232,25 @@ def test_what_a_companion_computer_streams_to_all_leaves_a_radio_its_telemetry_a
     assert got[1, "ATTITUDE"] > 20 and got[191, "VISION_POSITION_ESTIMATE"] > 20
 
 
+def test_client_that_asks_in_a_loop_for_what_is_refused_leaves_a_radio_its_telemetry(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each refusal was said to all, at the rate of the loop; nothing else fitted through the radio."""
+    radio, cable, robot = SlowLink(57.6), SlowLink(math.inf), Robot()
+    robot.refuse[Action.ARM] = "the pose is 1.2 s old; the battery of module 0 is not known; every axis needs thrust, and there is none"
+    links = iter((radio, cable))
+    monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address, warn: next(links))
+    program = mavlink.MAVLink(None, srcSystem=250, srcComponent=1)
+    arm = bytes(mavlink.MAVLink_command_long_message(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0).pack(program))
+    with closing(side_on("radio", "cable")) as side:
+        for _ in range(250):
+            side.station.take(1, arm, robot.tick * 10_000_000)
+            pump(side, robot, 4)
+        assert not side.links.dropped
+    parser = mavlink.MAVLink(None)
+    got = Counter(m.get_type() for frame in radio.frames for m in parser.parse_buffer(frame))
+    assert 9 * 3 <= got["STATUSTEXT"] <= 11 * 3, "in three pieces, once in a second"
+    assert got["ATTITUDE"] > 50
+
+
 def test_serial_link_carries_frames_both_ways() -> None:
     ours, theirs = pty.openpty()
     links = Links([f"{os.ttyname(theirs)},115200"])
