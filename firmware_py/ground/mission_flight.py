@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from firmware_py.core.setpoint import Trajectory
-from firmware_py.core.types import INFORMATION, WARNING, Action, Event, Mode
+from firmware_py.core.types import INFORMATION, NOTICE, WARNING, Action, Event, Mode
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.mission_items import (
     FASTEST,
@@ -172,7 +172,9 @@ class MissionFlight:
         wanted = {SPEED_STAYS: self._speed, SPEED_DEFAULT: None}.get(speed_m_s, speed_m_s)
         if wanted is not None and not SLOWEST <= wanted <= FASTEST:
             return _no_speed(wanted)
-        self._speed = wanted
+        before, self._speed = self._cruise, wanted
+        if self._flight is not None and self._cruise != before:
+            self._system.say(NOTICE, f"{self._cruise:g} m/s from the next flight on; the one under way keeps its speed")
         return ""
 
     def go_to(self, latitude_deg: float, longitude_deg: float, altitude_m: float, yaw: float, speed_m_s: float) -> str:

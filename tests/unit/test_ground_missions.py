@@ -257,9 +257,14 @@ def test_jump_that_comes_again_because_its_answer_was_lost_flies_on(
 
 
 def test_jump_to_the_item_that_is_flown_to_takes_up_another_speed(world: World, client: Client) -> None:
+    """The flight under way keeps its speed, and a person who asks for another is told so: the answer is ACCEPTED."""
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    client.command(178, 1, 0.2)
     fly(world, client)
+    assert "m/s" not in client.texts
     client.command(178, 1, 0.3)
+    world.run(2)
+    assert "0.3 m/s from the next flight on; the one under way keeps its speed" in client.texts
     client.command(224, -1)
     world.run(10)
     (job,) = world.station.jobs()
