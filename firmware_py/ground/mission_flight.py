@@ -94,8 +94,9 @@ class MissionFlight:
         p = self._system.subject.progress
         p.total, p.current = max(len(items) - self._first, 0), min(self._first, max(len(items) - 1, 0))
         p.state = READY if items else NO_MISSION
-        if self._flight is not None:
-            self._flight.replaced = self._flight.of_mission
+        if self._flight is not None and self._flight.of_mission and not self._flight.replaced:
+            self._flight.replaced = True
+            self._system.say(NOTICE, "the mission under way flies on, until it is paused or another is started")
 
     def amend(self, items: tuple[Item, ...]) -> None:
         """Changes items of the mission while it is not flown; it resumes at its current item."""

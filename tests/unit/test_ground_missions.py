@@ -156,6 +156,24 @@ def test_a_mission_is_refused_disarmed_or_when_there_is_none(world: World, clien
     assert "the vehicle is disarmed" in client.texts
 
 
+@pytest.mark.parametrize("cleared", [False, True])
+def test_mission_that_flies_on_though_it_was_replaced_or_cleared_says_so_once(world: World, client: Client, cleared: bool) -> None:
+    """The answer is ACCEPTED, and MISSION_CURRENT tells of the new mission, or of none."""
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    said = []
+    for _ in range(2):
+        client.clear()
+        if cleared:
+            client.send("MISSION_CLEAR_ALL", 1, 1)
+        else:
+            upload(world, client, [item(0, PLACES[1])])
+        world.run(110)
+        said.append(client.texts)
+    assert said == ["the mission under way flies on, until it is paused or another is started", ""]
+    assert world.robot.mode[0] == Mode.AUTO
+
+
 def test_new_mission_is_not_called_paused_or_done_when_the_old_one_ends(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     fly(world, client)
