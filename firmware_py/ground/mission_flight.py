@@ -91,6 +91,7 @@ class MissionFlight:
         if self._flight is not None and self._flight.of_mission and not self._flight.arrivals_s:
             self._end_before_it_began("its mission was replaced")
         self.amend(items)
+        self._repeat = []  # a client would take them for items of the new mission
         p = self._system.subject.progress
         p.total, p.current = max(len(items) - self._first, 0), min(self._first, max(len(items) - 1, 0))
         p.state = READY if items else NO_MISSION
@@ -145,6 +146,7 @@ class MissionFlight:
             return str(error)
         if not legs:
             return "nothing is left to fly"
+        self._repeat = [repeat for repeat in self._repeat if repeat[0] < legs[0].sequence]
         s.progress.state, s.progress.current, self._started_at_item = ACTIVE, legs[0].sequence, wanted
         self._begin(legs)
         return ""

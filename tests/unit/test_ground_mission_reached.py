@@ -155,6 +155,21 @@ def test_flight_to_one_place_is_told_to_be_late_too(world: World, client: Client
     assert client.texts.count("flight is late: 0.40 m from its place") == 1
 
 
+@pytest.mark.parametrize("anew", [False, True])
+def test_item_of_a_mission_that_is_over_is_not_told_again_in_the_next_one(world: World, client: Client, anew: bool) -> None:
+    """Clients take the item that they heard of last for the farthest: the new mission was done before it began."""
+    start(world, client, *(item(i, place) for i, place in enumerate(PLACES)))
+    world.run_until(lambda: "mission complete" in client.texts, 4000)
+    if anew:
+        client.clear()
+        client.command(176, 1, 4, 4)
+        world.run(2)
+    else:
+        upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    world.run(100)
+    assert not client.all("MISSION_ITEM_REACHED")
+
+
 def test_mission_that_was_replaced_in_flight_is_not_told_to_be_late(world: World, client: Client) -> None:
     world.robot.off_plan = HELD_BACK
     start(world, client, item(0, PLACES[0]))
