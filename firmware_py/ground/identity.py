@@ -122,5 +122,6 @@ SETTABLE = tuple(row.mode for row in MODE_TABLE if row.on_request)
 NAMES: Mapping[Mode, str] = {
     Mode.MANUAL: "Manual", Mode.STABILIZE: "Stabilize", Mode.ALT_HOLD: "Depth Hold", Mode.POSHOLD: "Position Hold",
     Mode.AUTO: "Auto", Mode.GUIDED: "Guided", Mode.SURFACE: "Surface", Mode.MOTOR_DETECT: "Motor Detection",
+    Mode.DOCK: "Dock",
 }  # fmt: skip
-"""Mode names shown in menus. QGroundControl pauses and starts missions by these names of a submarine's modes."""
+"""Mode names that stations show, in the order of AVAILABLE_MODES. QGroundControl pauses and starts missions of a submarine by them."""

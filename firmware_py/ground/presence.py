@@ -17,6 +17,8 @@ Station = tuple[int, int, int]
 """System id, component id, MAV_TYPE."""
 _NAK, _OPEN_TO_READ, _UNKNOWN_COMMAND, _FILE_NOT_FOUND = 129, 4, 7, 10
 """Codes of the file transfer protocol."""
+_NOT_SELECTABLE = 2
+"""MAV_MODE_PROPERTY: a mode that no person may select, named so that a station knows it when it comes."""
 CAPABILITIES = 0x2 | 0x4 | 0x8 | 0x40 | 0x80 | 0x800 | 0x2000
 """MAV_PROTOCOL_CAPABILITY: float parameters, MISSION_INT, COMMAND_INT, set-points of attitude and of local position,
 flight termination, MAVLINK2. Neither form of integer parameters is claimed."""
@@ -115,14 +117,15 @@ class Presence:
 
     def available_modes(self, arrival: Arrival) -> bool:
         """Answers a request for AVAILABLE_MODES: one mode by its index, or all modes for index 0. Returns whether the index exists."""
-        index, count = arrival.message["index"], len(SETTABLE)
+        index, count = arrival.message["index"], len(NAMES)
         if index not in range(count + 1):
             return False
         for number in [index] if index else range(1, count + 1):
-            mode = SETTABLE[number - 1]
+            mode = tuple(NAMES)[number - 1]
             values = {
                 "number_modes": count, "mode_index": number, "standard_mode": 0,
-                "custom_mode": self._system.subject.identity.custom_mode(mode), "properties": 0,
+                "custom_mode": self._system.subject.identity.custom_mode(mode),
+                "properties": 0 if mode in SETTABLE else _NOT_SELECTABLE,
                 "mode_name": NAMES[mode],
             }  # fmt: skip
             self._system.send(arrival.channel, "AVAILABLE_MODES", values)

@@ -107,7 +107,10 @@ def test_available_modes_are_told_one_by_one(world: World, client: Client) -> No
     assert len(modes) == modes[0].number_modes and modes[0].mode_name == "Manual"
     ask(world, client, 512, mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES, 4)
     assert (client.last("AVAILABLE_MODES").custom_mode, client.last("AVAILABLE_MODES").mode_name) == (px4(4, 3), "Position Hold")
-    assert ask(world, client, 512, mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES, 9) == mavlink.MAV_RESULT_DENIED
+    dock = modes[-1]
+    assert (dock.custom_mode, dock.mode_name, dock.properties) == (px4(4, 9), "Dock", mavlink.MAV_MODE_PROPERTY_NOT_USER_SELECTABLE)
+    assert not any(mode.properties for mode in modes[:-1])
+    assert ask(world, client, 512, mavlink.MAVLINK_MSG_ID_AVAILABLE_MODES, 10) == mavlink.MAV_RESULT_DENIED
 
 
 def test_home_position_can_be_asked_for(world: World, client: Client) -> None:
