@@ -92,7 +92,7 @@ TABLE = (
     Row("imu_lost", "no IMU", "imu_age_s", LASTS),
     Row("module_silent", "a module is silent", "silent_s", LASTS),
     Row("ticks_missed", "ticks missed", "missed_ticks_per_s", ": {:.0f} in a second"),
-    Row("fence", "outside the fence", "outside_m", " by {:.2f} m", modes=MOVING),
+    Row("fence", "outside the fence", "outside_m", " by {:.2f} m", modes=MOVING, forced_modes=frozenset({Mode.ALT_HOLD})),
     Row("collision", "another body is in the way", "collision_s", ", {:.1f} s to brake", below=True, modes=FREE, warned_modes=PILOTED),
     Row("ground_lost", "ground station silent", "ground_age_s", LASTS, modes=ANY - {Mode.AUTO, Mode.SURFACE}),
     Row("pilot_lost", "pilot silent", "pilot_age_s", LASTS, modes=PILOTED),

@@ -6,10 +6,6 @@ import numpy as np
 
 from firmware_py.description.failsafe_parameters import Fence
 
-ON_FENCE_M = 0.05
-"""Distance beyond the fence up to which a body is on it, not outside. Set-points and mission items may lie on the fence, and a body that
-holds such a place moves about it by some millimetres (measured: 2 mm); an item may lie 0.02 m beyond (`ground.mission_items`)."""
-
 
 def beyond(p_w: np.ndarray, fence: Fence) -> dict[str, float]:
     """Returns how far a position (3,) is beyond each side of the fence, by the side's name, m; negative inside."""
@@ -22,6 +18,5 @@ def _beyond(p_w: np.ndarray, fence: Fence) -> tuple[float, float, float, float]:
 
 
 def outside(p_w: np.ndarray, fence: Fence) -> float:
-    """Returns how far a position (3,) is beyond the fence, m; negative inside, at most 0 up to ON_FENCE_M beyond."""
-    most = max(_beyond(p_w, fence))
-    return most if most > ON_FENCE_M else min(most, 0.0)
+    """Returns how far a position (3,) is beyond the fence, m; negative inside."""
+    return max(_beyond(p_w, fence))

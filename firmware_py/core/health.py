@@ -65,7 +65,7 @@ class Health(NamedTuple):
     stick: float
     """Largest deflection of any stick axis, 0 to 1."""
     outside_m: float
-    """How far the body is beyond the fence; at most 0 inside and on it; NaN without a pose."""
+    """How far the body is beyond the fence; negative inside; NaN without a pose."""
     dead: tuple[int, ...]
     """Indices of thrusters that count as dead or lying."""
     lost_axes: int

@@ -168,9 +168,9 @@ class Failsafes:
     ticks_missed_delay_s: float = delay(0.5, "FS_TICK_S")
     ticks_missed_action: int = action(2, "FS_TICK_ACT")
     ticks_missed_latched: int = latched(0, "FS_TICK_LAT")
-    # outside the fence
+    # outside the fence. A body that holds a place on it moves about that place by millimetres, and a mission's item may lie 20 mm beyond
     fence_limit: float = quantity(
-        0.0, unit="m", low=0, high=10, help="largest permitted distance of the body beyond the fence", mavlink="FS_FENC_LIM"
+        0.05, unit="m", low=0, high=10, help="largest permitted distance of the body beyond the fence", mavlink="FS_FENC_LIM"
     )
     fence_delay_s: float = delay(0.2, "FS_FENC_S")
     fence_action: int = action(2, "FS_FENC_ACT")

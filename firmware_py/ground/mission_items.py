@@ -39,7 +39,7 @@ _MOST_STEPS = 1000
 _LONGEST_S = 86_400.0
 _BEYOND = {"north_m": INVALID_X, "east_m": INVALID_Y, "top_m": INVALID_Z, "bottom_m": INVALID_Z}
 """Result for an item that lies beyond the given side of the fence."""
-_ON_FENCE_M = 0.02
+ON_FENCE_M = 0.02
 """Tolerance of the fence check: the wire's resolution of 1e-7 degrees is 11 mm."""
 
 
@@ -144,7 +144,7 @@ def _fault(item: Item) -> int:
 def beyond_fence(place: np.ndarray, fence: Fence) -> tuple[int, str]:
     """Checks a place (3,) NED, m. Returns a MAV_MISSION_RESULT, 0 inside, and in words which side of the fence the place is beyond."""
     for side, beyond_m in beyond(place, fence).items():
-        if beyond_m > _ON_FENCE_M:
+        if beyond_m > ON_FENCE_M:
             return _BEYOND[side], f"{beyond_m:.2f} m beyond {limits_of(Fence, side).mavlink}, {getattr(fence, side):g} m"
     return 0, ""
 

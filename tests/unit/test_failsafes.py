@@ -9,6 +9,7 @@ from firmware_py.core.failsafes import ANY, FREE, MOVING, PERMITTED, PILOTED, PL
 from firmware_py.core.health import UNSEEN_S, Health
 from firmware_py.core.types import Mode
 from firmware_py.description.failsafe_parameters import Failsafes as Parameters
+from firmware_py.ground import mission_items
 from tests.unit.failsafe_causes import FIELDS, ROWS, YES, P, bad, quick, spoilt
 from tests.unit.healths import GOOD, UPRIGHT, at
 
@@ -78,6 +79,12 @@ def test_nearer_body_is_the_worse_one() -> None:
     assert alarms_of(quick("collision"), GOOD._replace(collision_s=0.3)) == []
 
 
+def test_body_that_holds_a_place_on_the_fence_is_not_outside() -> None:
+    """It moves about that place by millimetres, and an item of a mission may lie a little beyond."""
+    assert alarms_of(quick("fence"), GOOD._replace(outside_m=0.005 + mission_items.ON_FENCE_M), Mode.AUTO) == []
+    assert alarms_of(quick("fence"), GOOD._replace(outside_m=0.1), Mode.AUTO)
+
+
 COUNTS = {
     "depth_unknown": POSE_MODES | {Mode.ALT_HOLD},
     "tag_gone": POSE_MODES,
@@ -101,8 +108,8 @@ def test_fail_safe_counts_in_its_modes_alone(name: str, mode: Mode) -> None:
 
 @pytest.mark.parametrize("name", FIELDS)
 @pytest.mark.parametrize("mode", Mode, ids=lambda mode: mode.name)
-def test_mode_that_a_fail_safe_chose_is_left_when_tags_do_not_come_back(name: str, mode: Mode) -> None:
-    expected = mode in COUNTS.get(name, set(Mode)) or (name == "tag_gone" and mode == Mode.ALT_HOLD)
+def test_mode_that_a_fail_safe_chose_is_watched_for_tags_that_stay_away_and_for_the_fence(name: str, mode: Mode) -> None:
+    expected = mode in COUNTS.get(name, set(Mode)) or (name in ("tag_gone", "fence") and mode == Mode.ALT_HOLD)
     assert bool(alarms_of(quick(name), bad(name), mode, forced=True)) == expected
 
 
@@ -232,7 +239,7 @@ WORDS = {
     "imu_lost": "no IMU for 0.5 s",
     "module_silent": "a module is silent for 0.5 s",
     "ticks_missed": "ticks missed: 5 in a second",
-    "fence": "outside the fence by 0.00 m",
+    "fence": "outside the fence by 0.05 m",
     "collision": "another body is in the way, 0.2 s to brake",
     "ground_lost": "ground station silent for 5.0 s",
     "pilot_lost": "pilot silent for 1.0 s",
