@@ -32,11 +32,11 @@ from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.files import FileWriter
 from firmware_py.ground.link import Links
+from firmware_py.ground.link_address import LinkError
 from firmware_py.ground.mission_flight import Plan, PlanJob
 from firmware_py.ground.signing import FILE_MODE, Signing, load_signing
 from firmware_py.ground.station import GroundStation
 from firmware_py.ground.system import STOPPING
-from firmware_py.ground.transport import LinkError
 from firmware_py.runtime.clock import MonotonicClock, unix_ns
 from firmware_py.runtime.interrupts import signals_blocked
 from firmware_py.runtime.rate_keeper import RateKeeper

@@ -27,7 +27,7 @@ class Ground:
         mavlink="GUID_FRESH",
     )
     watch_s: float = quantity(
-        5.0,
+        3.0,  # less than FS_GCS_LIM: an onlooker who was heard first and leaves must not count as the loss of the pilot's station
         unit="s",
         low=0.5,
         high=600,

@@ -10,7 +10,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from firmware_py.ground.transport import Link, LinkError, open_link
+from firmware_py.ground.link_address import LinkError, open_link
+from firmware_py.ground.transport import Link
 
 TRUSTED = "+trusted"
 """Suffix of an address whose link may set the signing key."""

@@ -197,7 +197,7 @@ def test_body_that_has_parted_watches_the_station_that_all_watch(world: World, c
     world.robot.bodies = apart
     world.run(1)
     world.robot.asked.clear()
-    for _ in range(4):
+    for _ in range(2):
         other.heartbeat()
         world.run(100)
     assert not [request for request in world.robot.asked if request.action == Action.GROUND_ALIVE]

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from firmware_py.ground.link import Channel, Links
-from firmware_py.ground.transport import LinkError, open_link
+from firmware_py.ground.link_address import LinkError, open_link
 from tests.unit.ground_sides import PATIENCE_S, free_port, received
 from tests.unit.ground_world import World
 
@@ -233,9 +233,9 @@ def test_station_whose_name_nobody_knows_yet_is_spoken_to_when_somebody_does_and
         return "127.0.0.1"
 
     if not answers:
-        monkeypatch.setattr("firmware_py.ground.transport._ANSWER_S", 0.0)
-    monkeypatch.setattr("firmware_py.ground.transport.socket.gethostbyname", resolve)
-    monkeypatch.setattr("firmware_py.ground.transport._RESOLVE_EVERY_S", 0.0)
+        monkeypatch.setattr("firmware_py.ground.link_address._ANSWER_S", 0.0)
+    monkeypatch.setattr("firmware_py.ground.link_address.socket.gethostbyname", resolve)
+    monkeypatch.setattr("firmware_py.ground.link_address._RESOLVE_EVERY_S", 0.0)
     with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as station:
         station.bind(("127.0.0.1", 0))
         station.setblocking(False)

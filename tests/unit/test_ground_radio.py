@@ -20,9 +20,9 @@ from pymavlink.dialects.v20 import all as mavlink
 from firmware_py.core.types import Action, Event
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.link import Links
+from firmware_py.ground.link_address import LinkError
 from firmware_py.ground.signing import Signing
 from firmware_py.ground.telemetry import DEFAULT_HZ
-from firmware_py.ground.transport import LinkError
 from firmware_py.ground.wire import checksum
 from tests.unit.ground_attack import KEY, NOW
 from tests.unit.ground_sides import PATIENCE_S, free_port, heartbeat, pump, received, side_on
