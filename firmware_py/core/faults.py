@@ -20,7 +20,7 @@ from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import polynomial
 from firmware_py.core.thruster_names import name_of, places_of
 from firmware_py.core.topology import in_both
-from firmware_py.core.types import Estimate, Measured, ModuleInputs
+from firmware_py.core.types import MCU_TIMED_OUT, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 
 ESC_DOWN = (1, 3)
@@ -47,6 +47,9 @@ SILENT_NS = 500_000_000
 """Silence after which a module's thrusters are excluded, if the others can make every wrench without them; the fail-safe `module_silent`
 acts then too. A module that hears nothing either has stopped its thrusters after 100 ms (DESIGN's bus); one that still hears stops them
 because of the exclusion."""
+DEAF_NS = 300_000_000
+"""How long a module counts as deaf after it last reported that it hears no commands: four lags, until its propellers turn again. Meanwhile
+a standstill is no fault of its thrusters; the module counts as silent."""
 FEEDBACK_WEIGHT = 0.3
 """Weight of one ESC feedback in the running share of force that a thruster reports. Ten come per second (DESIGN's bus), which gives a
 memory of 0.3 s: less than the half second of motion that core.missing_thrust judges."""
@@ -113,6 +116,9 @@ class FaultDetector:
         """Ticks that each module has been silent; counts down again while an excluded module is heard."""
         self._silent: list[int] = []
         """Modules, by place in the body, whose thrusters are left out because of their silence."""
+        self._deaf_ticks = max(1, DEAF_NS // period_ns)
+        self._deaf = [0] * len(body.modules)
+        """Ticks for which each module goes on counting as deaf."""
         self._rank = self._steered_rank(t.matrix)
         self._counts = np.zeros((n, len(WHY)), dtype=np.int64)
         """(n, 3) feedbacks in a row that showed ESC_FAILED, STALLED and WRONG_SPEED."""
@@ -135,6 +141,7 @@ class FaultDetector:
         for other in before:
             for i, j in in_both(self._modules, other._modules):
                 self._silence[i] = other._silence[j]
+                self._deaf[i] = other._deaf[j]
                 self._silent += [i] if j in other._silent else []
                 for channel, thruster in self._thruster_at[i].items():
                     number = other._thruster_at[j][channel]
@@ -171,21 +178,24 @@ class FaultDetector:
             free: no magnet pulls at another body or pushes anything away; while one does, the motion says nothing about thrusters.
         """
         self.words, self.changed = [], False
+        own = [modules[m] for m in self._modules]
+        for i, module in enumerate(own):
+            self._deaf[i] = self._deaf_ticks if module.mcu_state == MCU_TIMED_OUT else max(0, self._deaf[i] - 1)
+        free = free and not any(self._deaf)
         found = self._motion.step(measured, estimate, mean_n * self._reported_share, self.now.alive, armed, free)
         if found is not None:
             self._lose(found, "does not push as it says")
         elif self._motion.acquitted is not None:
             self._take_back(self._motion.acquitted)
-        own = [modules[m] for m in self._modules]
         (self._judge_feedback if armed else self._judge_at_rest)(own, force_n)
         self._judge_silence(own, armed)
         return self.now
 
     def _judge_silence(self, modules: list[ModuleInputs], armed: bool) -> None:
-        """Excludes the thrusters of modules that have fallen silent; re-admits them once the module has been heard for as long again."""
+        """Excludes the thrusters of modules that have fallen silent or deaf; re-admits them once a module has been well for as long."""
         before = self._silent
         for i, module in enumerate(modules):
-            if not module.heard:
+            if not module.heard or self._deaf[i]:
                 self._silence[i] = min(self._silence[i] + 1, self._silent_after)
             elif self._silence[i]:
                 self._silence[i] = self._silence[i] - 1 if i in before else 0
@@ -193,6 +203,8 @@ class FaultDetector:
         self._silent = quiet if armed else []
         if self._silent == before:
             return
+        deaf = [str(self._modules[i]) for i in self._silent if self._deaf[i] and i not in before]
+        self.words += [f"module {', '.join(deaf)} does not hear its commands: its thrusters stop"] if deaf else []
         alive, self.now = self.now.alive, self._usable_state()
         if not np.array_equal(alive, self.now.alive):
             self.changed = True
@@ -222,7 +234,10 @@ class FaultDetector:
         feedback = np.array(numbers, dtype=np.float64).reshape(-1, 3, 2)
         full, limits = (self._full_n, self._t.rpm_at_full), (*self._limits, self._needed)
         state = (self._counts, self._feedback_means, self._reported_share)
-        if count_feedback(feedback, force_n, self.now.alive, *full, *limits, *state):
+        found = count_feedback(feedback, force_n, self.now.alive, *full, *limits, *state)
+        if any(self._deaf):
+            self._counts[np.isin(self._t.module, np.flatnonzero(self._deaf))] = 0
+        if found:
             for i, kind in np.argwhere(self._counts >= self._needed).tolist():
                 if self.now.alive[i]:
                     self._lose(i, WHY[kind])

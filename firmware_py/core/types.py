@@ -20,8 +20,8 @@ CHANNELS, FACES = MOST_THRUSTERS, 6
 """Number of thruster commands in one module's frames; number of docking faces of a module, each with its relay."""
 RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
 """States of a docking relay, as DOCK_CMD has them."""
-MCU_ESTOP = 4
-"""MCU_STATUS state of a module that is held by an e-stop."""
+MCU_TIMED_OUT, MCU_ESTOP = 3, 4
+"""MCU_STATUS states of a module whose thrusters stand still: it hears no commands, or is held by an e-stop."""
 MCU_UNFIT = (0, 5)
 """MCU_STATUS states of a module that is starting, or has a fault of its own."""
 CRITICAL, WARNING, NOTICE, INFORMATION = 2, 4, 5, 6

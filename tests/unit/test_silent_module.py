@@ -3,7 +3,7 @@
 import numpy as np
 
 from firmware_py.core.faults import FaultDetector
-from firmware_py.core.types import Estimate, Measured, ModuleInputs
+from firmware_py.core.types import MCU_TIMED_OUT, EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -20,14 +20,19 @@ class DetectorRig:
         self.body = assemble([(n, 0, 0) for n in range(count)], [0] * count, [cube] * count, list(range(count)))
         self.detector = FaultDetector(self.body, Faults(), TICK_NS)
 
-    def run(self, seconds: float, *heard: int, armed: bool = True) -> list[str]:
-        """Runs the detector with only the modules `heard` answering; returns its messages."""
+    def run(self, seconds: float, *heard: int, armed: bool = True, deaf: int | None = None, force_n: float = 0.0) -> list[str]:
+        """Runs the detector with only the modules `heard` answering, and `deaf` saying that it hears no commands; returns its messages.
+
+        All propellers stand still, although they are to push with `force_n`.
+        """
         said, n = [], self.body.thrusters.f_max.size
-        modules = [ModuleInputs(heard=m in heard) for m in range(len(self.body.modules))]
+        modules = [ModuleInputs(heard=m in heard, mcu_state=MCU_TIMED_OUT if m == deaf else None) for m in range(len(self.body.modules))]
+        for module in modules:
+            module.esc = [EscFeedback(first, (0.0, 0.0), (0.0, 0.0), (0, 0)) for first in range(0, 8, 2)] if force_n else []
         estimate = Estimate(ZERO, np.eye(1, 4)[0], np.zeros(6), ZERO, ZERO, ZERO, ZERO, 0, 1.0, 6, 0, True)
         for _ in range(round(seconds / DT)):
-            self.detector.step(modules, Measured(None, None, None, []), estimate, np.zeros(n), np.zeros(n), armed, True)
-            assert self.detector.changed == bool(self.detector.words)
+            self.detector.step(modules, Measured(None, None, None, []), estimate, np.full(n, force_n), np.full(n, force_n), armed, True)
+            assert self.detector.changed == any("left out" in words or "again" in words for words in self.detector.words)
             said += self.detector.words
         return said
 
@@ -89,3 +94,19 @@ def test_body_that_is_made_of_others_leaves_out_the_modules_that_were_silent_in_
     three.run(1.0, 0, 2)
     rig.detector.take_over([three.detector])
     assert rig.used == {0} and rig.run(0.1, 0) == []
+
+
+def test_thrusters_that_stand_still_because_their_module_hears_no_commands_are_not_found_faulty() -> None:
+    rig = DetectorRig(1)
+    assert rig.run(1.0, 0, deaf=0, force_n=2.0) == ["module 0 does not hear its commands: its thrusters stop"]
+    assert rig.run(0.25, 0, force_n=2.0) == [], "its propellers may still be starting"
+    assert rig.used == {0}
+    assert rig.run(0.2, 0, force_n=2.0)[0] == "thruster 1 of module 0 stands still: left out"
+
+
+def test_thrusters_of_a_module_that_hears_no_commands_are_left_out_until_it_does() -> None:
+    rig = DetectorRig()
+    said = rig.run(1.0, 0, 1, deaf=1)
+    assert said == ["module 1 does not hear its commands: its thrusters stop", "thrusters of silent module 1 are left out"]
+    assert rig.used == {0}
+    assert rig.run(1.0, 0, 1) == ["thrusters of every module are used again"] and rig.used == {0, 1}
