@@ -109,6 +109,7 @@ class Guidance:
         self._lead_s = parameters.control.lead_s
         f = parameters.failsafes
         self._no_place_s, self._no_depth_s = f.tag_lost_limit, f.depth_unknown_limit
+        self._most_push_m_s = f.pushed_limit if f.pushed_action > Level.WARN else math.inf
         self._least_s = f.collision_limit if f.collision_action >= Level.HOLD else 0.0
         self._arrival_s = f.collision_limit + float(braking_s(np.array([p.speed_m_s, 0.0]), self._body.deceleration, p.bandwidth))
         self._full_stick = p.stick_share * self._body.thrusters.full_wrench
@@ -349,8 +350,10 @@ class Guidance:
         return np.where(np.abs(self._inside(soon) - soon) > np.abs(self._inside(p_wb) - p_wb), 0.0, v_w)
 
     def _placed(self, health: Health) -> bool:
-        """Whether tags tell the position, or did lately."""
-        return health.ready and health.tag_age_s <= self._no_place_s
+        """Whether tags tell the position, or did lately and nothing pushes the body out of sight: the believed position would run away, and
+        a body that surfaces swim after it (the fail-safe `pushed` lets go in other modes).
+        """
+        return health.ready and health.tag_age_s <= self._no_place_s and health.unseen_push_m_s <= self._most_push_m_s
 
     # ------------------------------------------------------------ the wrench
 

@@ -31,6 +31,8 @@ def test_surfacing_robot_lifts_blindly_when_it_must() -> None:
         (BLIND, [0.0, 0.0, lift, 0.0, 0.0, 0.0]),
         (GOOD._replace(tag_age_s=9.0, depth_age_s=9.0), [0.0, 0.0, lift, *WRENCH[3:]]),
         (GOOD._replace(tag_age_s=9.0), [0.0, 0.0, -0.5 * lift, *WRENCH[3:]]),
+        (GOOD._replace(tag_age_s=1.0, push_m_s=0.6), [0.0, 0.0, -0.5 * lift, *WRENCH[3:]]),
+        (GOOD._replace(push_m_s=0.6), [*WRENCH[:2], -0.5 * lift, *WRENCH[3:]]),
         (GOOD, [*WRENCH[:2], -0.5 * lift, *WRENCH[3:]]),
     ):
         flight = Flight()
@@ -107,6 +109,16 @@ def test_robot_that_falls_back_on_gravity_goes_on_from_where_it_is_believed_to_b
     flight.estimate = estimate((0.0, 0.0, 1.3), from_euler(0.0, 0.0, 2.5))
     now = flight.run(0.01, health=UPRIGHT, follows=False)
     assert np.linalg.norm(difference(now.q_wb, flight.estimate.q_wb)) < 0.01
+
+
+def test_surfacing_robot_that_is_pushed_out_of_sight_does_not_swim_back() -> None:
+    """Believed speed and push ran away together: a robot with a weak thruster swam three metres into a wall instead of rising."""
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+    flight.run(0.5)
+    flight.estimate = estimate((0.3, 0.0, 1.0))
+    now = flight.run(0.1, health=GOOD._replace(tag_age_s=1.0, push_m_s=0.6), follows=False)
+    assert now.p_wb[0] == pytest.approx(0.3)
 
 
 def test_tags_that_come_back_move_no_set_point() -> None:
