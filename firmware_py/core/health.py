@@ -90,6 +90,8 @@ class Health(NamedTuple):
     """Places without a thruster by the vehicle file from which an ESC answers."""
     collision_s: float = math.nan
     """Time after which the body must brake to stop before another that it moves towards (core.collision), s; NaN if there is none."""
+    unready_s: float = 0.0
+    """Time since an attitude was last known; counts from the start until one is."""
     without_thrust: tuple[str, ...] = ()
     """Axes that no thruster of the body can push although the vehicle does not declare them passive."""
 
@@ -107,8 +109,8 @@ class Health(NamedTuple):
 
     @property
     def depth_unknown_s(self) -> float:
-        """Age of the newest depth information, from pressure or tag."""
-        return min(self.depth_age_s, self.tag_age_s)
+        """Age of the newest depth information, from pressure or tag; at least the time without an estimate, which alone makes use of it."""
+        return max(min(self.depth_age_s, self.tag_age_s), self.unready_s)
 
     @property
     def partner_lost(self) -> bool:

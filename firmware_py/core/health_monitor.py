@@ -42,6 +42,8 @@ class _Latest:
     imu_ns: int = NEVER_NS
     depth_ns: int = NEVER_NS
     depth_heard: bool = False
+    ready_ns: int = NEVER_NS
+    """When an attitude was last known."""
     foreign_sync_ns: int = NEVER_NS
     foreign_command_ns: int = NEVER_NS
     ground_ns: int = NEVER_NS
@@ -116,7 +118,7 @@ class HealthMonitor:
         """Returns the figures of this tick, and stores them in `now`."""
         now, latest = inputs.time_ns, self._latest
         if latest.time_ns == NEVER_NS:  # first tick: silence counts from here
-            latest.time_ns = latest.depth_ns = latest.imu_ns = now
+            latest.time_ns = latest.depth_ns = latest.imu_ns = latest.ready_ns = now
             self._heard_ns.update(dict.fromkeys(self._heard_ns, now))
         self._listen(inputs.modules, now)
         self._hear_stops(inputs.modules, now)
@@ -124,6 +126,8 @@ class HealthMonitor:
             latest.imu_ns = now
         if self.pressure_heard:
             latest.depth_ns, latest.depth_heard = now, True
+        if estimate.ready:
+            latest.ready_ns = now
         if inputs.foreign_sync:
             latest.foreign_sync_ns = now
         if inputs.foreign_command:
@@ -178,6 +182,7 @@ class HealthMonitor:
             push_m_s=math.sqrt(latest.push_m2_s2),
             esc_unknown=tuple([at for at, ns in self._unknown_esc_ns.items() if now - ns <= self._esc_fresh_ns]),
             collision_s=self.collision_s,
+            unready_s=(now - latest.ready_ns) * 1e-9,
             without_thrust=self._without_thrust,
         )
 

@@ -369,6 +369,19 @@ def test_depth_is_known_from_the_first_that_is_heard() -> None:
     assert whole.step().depth_heard
 
 
+def test_depth_counts_as_unknown_while_there_is_no_estimate_to_use_it() -> None:
+    """A robot without IMU and tags went on by its last estimate for eighteen seconds, and rose by two and a half metres."""
+    bench = MonitorBench()
+    bench.step()
+    health = bench.wait(6.0, one=here(pressure_pa=2e5), ready=False)
+    assert health.depth_age_s == 0.0 and health.depth_unknown_s == pytest.approx(6.0)
+    joined = HealthMonitor(SINGLE, Parameters(), TICK_NS)
+    joined.take_over([bench.monitor])
+    bench.monitor = joined
+    assert bench.step(one=here(pressure_pa=2e5), ready=False).depth_unknown_s == pytest.approx(6.01)
+    assert bench.step(one=here(pressure_pa=2e5)).depth_unknown_s == 0.0
+
+
 def test_imu_is_as_old_as_its_last_sample_that_was_believed() -> None:
     bench = MonitorBench()
     assert bench.wait(0.5).imu_age_s == 0.0
