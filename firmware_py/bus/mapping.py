@@ -101,7 +101,8 @@ class InputCollector:
         modules, self._modules = self._modules, [ModuleInputs() for _ in self._modules]
         wanted = tick & 0xFFFF
         for index, module in enumerate(modules):
-            module.answered = self._status_ticks[index] == wanted
+            answer = self._status_ticks[index]
+            module.answered, module.late_ticks = answer == wanted, 0 if answer is None else (wanted - answer) & 0xFFFF
             self._status_ticks[index] = None  # an answer counts once: the same 16 bits recur after 65536 ticks
             if module.tags:
                 module.tags = [tag for tag in module.tags if self._is_timely(tag, time_ns)]

@@ -8,6 +8,7 @@ A thruster that was found faulty stays excluded until the body is disarmed, unle
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -50,6 +51,9 @@ because of the exclusion."""
 DEAF_NS = 300_000_000
 """How long a module counts as deaf after it last reported that it hears no commands: four lags, until its propellers turn again. Meanwhile
 a standstill is no fault of its thrusters; the module counts as silent."""
+BELIEVED_NS = 500_000_000
+"""How long believed forces are kept: the feedback of a module whose answers come late is compared with those of its own time. Against the
+present ones, propellers that reverse seemed to disobey where frames were 30 ms late each way."""
 FEEDBACK_WEIGHT = 0.3
 """Weight of one ESC feedback in the running share of force that a thruster reports. Ten come per second (DESIGN's bus), which gives a
 memory of 0.3 s: less than the half second of motion that core.missing_thrust judges."""
@@ -119,6 +123,10 @@ class FaultDetector:
         self._deaf_ticks = max(1, DEAF_NS // period_ns)
         self._deaf = [0] * len(body.modules)
         """Ticks for which each module goes on counting as deaf."""
+        self._believed: deque[np.ndarray] = deque(maxlen=max(1, BELIEVED_NS // period_ns))
+        """Believed forces (n,) of the latest ticks, N."""
+        self._late_ticks = [0] * len(body.modules)
+        """How late each module's latest answer was."""
         self._rank = self._steered_rank(t.matrix)
         self._counts = np.zeros((n, len(WHY)), dtype=np.int64)
         """(n, 3) feedbacks in a row that showed ESC_FAILED, STALLED and WRONG_SPEED."""
@@ -181,15 +189,25 @@ class FaultDetector:
         own = [modules[m] for m in self._modules]
         for i, module in enumerate(own):
             self._deaf[i] = self._deaf_ticks if module.mcu_state == MCU_TIMED_OUT else max(0, self._deaf[i] - 1)
+            self._late_ticks[i] = self._late_ticks[i] if module.mcu_state is None else module.late_ticks
+        self._believed.append(force_n)
         free = free and not any(self._deaf)
         found = self._motion.step(measured, estimate, mean_n * self._reported_share, self.now.alive, armed, free)
         if found is not None:
             self._lose(found, "does not push as it says")
         elif self._motion.acquitted is not None:
             self._take_back(self._motion.acquitted)
-        (self._judge_feedback if armed else self._judge_at_rest)(own, force_n)
+        (self._judge_feedback if armed else self._judge_at_rest)(own, self._believed_at_answers())
         self._judge_silence(own, armed)
         return self.now
+
+    def _believed_at_answers(self) -> np.ndarray:
+        """Returns the believed forces (n,) at the time of each module's latest answer, N; the present ones where that is not kept."""
+        force_n = self._believed[-1]
+        for i, late_ticks in enumerate(self._late_ticks):
+            if 0 < late_ticks < len(self._believed):
+                force_n = np.where(self._t.module == i, self._believed[-1 - late_ticks], force_n)
+        return force_n
 
     def _judge_silence(self, modules: list[ModuleInputs], armed: bool) -> None:
         """Excludes the thrusters of modules that have fallen silent or deaf; re-admits them once a module has been well for as long."""

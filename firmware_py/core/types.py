@@ -89,6 +89,8 @@ class ModuleInputs:
     mcu_state: int | None = None
     answered: bool = False
     """Whether its MCU_STATUS of this tick has arrived."""
+    late_ticks: int = 0
+    """How many ticks old the newest MCU_STATUS is that has arrived since the previous tick."""
     heard: bool = False
     """Whether any frame of the module came."""
 

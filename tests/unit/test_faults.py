@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from firmware_py.core.faults import CLEAR
+from firmware_py.core.faults import CLEAR, FaultDetector
+from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 from tests.unit.robot_in_water import BODY, DT, PUSH, Water
 
@@ -146,3 +147,26 @@ def test_change_is_said_once(water: Water) -> None:
         water.run(DT)
         changes.append(water.detector.changed)
     assert sum(changes) == 1
+
+
+def _said_with_late_answers(late_ticks: int, told_ticks: int, standing: int = -1) -> list[str]:
+    """Messages about a robot whose thrusters reverse all the time, and whose answers are `late_ticks` old but seem `told_ticks` old."""
+    detector, n, zero = FaultDetector(BODY, Faults(), round(DT * 1e9)), BODY.thrusters.f_max.size, np.zeros(3)
+    believed = [np.full(n, 2.0 * np.sin(9.0 * DT * tick)) for tick in range(300)]
+    estimate, said = Estimate(zero, np.eye(1, 4)[0], np.zeros(6), zero, zero, zero, zero, 0, 1.0, 6, 0, True), []
+    for tick, force_n in enumerate(believed):
+        module = ModuleInputs(heard=True, mcu_state=2, late_ticks=told_ticks)
+        if tick % 10 == 0:
+            rpm = [detector.believed_rpm(i, believed[max(0, tick - late_ticks)][i]) * (i != standing) for i in range(n)]
+            module.esc = [EscFeedback(i, (rpm[i], rpm[i + 1]), (0.0, 0.0), (0, 0)) for i in range(0, n, 2)]
+        detector.step([module], Measured(None, None, None, []), estimate, force_n, force_n, True, True)
+        said += detector.words
+    return said
+
+
+def test_feedback_that_comes_late_is_compared_with_the_forces_of_its_own_time() -> None:
+    """With frames 30 ms late each way healthy thrusters seemed to disobey; without them the robot tumbled."""
+    assert _said_with_late_answers(0, 0) == _said_with_late_answers(16, 16) == []
+    assert "does not obey" in _said_with_late_answers(16, 0)[0], "it would matter"
+    assert _said_with_late_answers(16, 16, standing=3) == ["thruster 4 of module 0 stands still: left out"]
+    assert _said_with_late_answers(0, 60_000) == [], "as an answer of the future seems, after a restart"

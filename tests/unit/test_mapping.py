@@ -103,6 +103,10 @@ def test_module_answers_a_tick_with_the_status_of_that_tick_alone():
     late = robot.tick(65_538).modules[0]
     assert late.heard
     assert not late.answered
+    assert late.late_ticks == 1
+    robot.say("MCU_STATUS", (65_535, 1, 0, 2))
+    assert robot.tick(65_539).modules[0].late_ticks == 4
+    assert robot.tick(65_540).modules[0].late_ticks == 0
 
 
 def test_module_that_fell_silent_does_not_answer_again_when_the_count_of_ticks_comes_round():
