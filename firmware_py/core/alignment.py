@@ -43,6 +43,12 @@ def upright(gyros: np.ndarray, accels: np.ndarray) -> np.ndarray | None:
     return from_euler(math.atan2(y, z), math.asin(max(-1.0, min(1.0, -x / force))), 0.0)
 
 
+def tilt_between(a: np.ndarray, b: np.ndarray) -> float:
+    """Returns the angle, rad, between the tilts of two attitudes (4,), whatever their headings."""
+    _, x, y, _ = multiply(a, conjugate(b)).tolist()
+    return 2.0 * math.asin(min(1.0, math.hypot(x, y)))
+
+
 class TagAgreement:
     """Screens tag poses before the position is known: counts the run of those that agree with gravity and with the one before."""
 
@@ -56,9 +62,9 @@ class TagAgreement:
         For a pose that agrees, updates `count`: compares the heading and position change that it implies for the body at p_wb (3,), m, with
         those of the pose before.
         """
-        w, x, y, z = multiply(pose.q_wb, conjugate(q_wb)).tolist()
-        if 2.0 * math.asin(min(1.0, math.hypot(x, y))) > FLIP_RAD:
+        if tilt_between(pose.q_wb, q_wb) > FLIP_RAD:
             return False
+        w, _, _, z = multiply(pose.q_wb, conjugate(q_wb)).tolist()
         heading, offset = 2.0 * math.atan2(z, w), pose.p_wt - rotate(pose.q_wb, pose.lever_b) - p_wb
         turned = abs(math.remainder(heading - self._heading, 2.0 * math.pi))  # NaN at first, which agrees with nothing
         gap_s = (pose.capture_ns - self._capture_ns) * 1e-9

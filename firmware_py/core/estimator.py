@@ -20,10 +20,11 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core import observation
-from firmware_py.core.alignment import TagAgreement, upright
+from firmware_py.core.alignment import TagAgreement, tilt_between, upright
 from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.depth_gate import MOST_STEP_M
 from firmware_py.core.history import WINDOW_NS, History
+from firmware_py.core.measurements import FLIP_RAD
 from firmware_py.core.propagation import ERRORS, STATES, Error, Nominal
 from firmware_py.core.rigid_body import restoring_moment
 from firmware_py.core.rotations import heading, multiply, rotate, to_matrix
@@ -217,8 +218,7 @@ class Estimator:
         self._waited_ticks += 1
         if self._waited_ticks * self._dt <= UPRIGHT_AFTER_S:
             return
-        _, gyros, accels_depths = self._history.since(self._history.first_after(time_ns - GRAVITY_WINDOW_NS))
-        tilt = upright(gyros, accels_depths[:, :3])
+        tilt, accels_depths = self._by_gravity()
         if tilt is None:
             return
         depths = accels_depths[:, 3][~np.isnan(accels_depths[:, 3])]
@@ -226,6 +226,11 @@ class Estimator:
         self._start(BodyPose(time_ns, place, np.zeros(3), multiply(heading(self._now[Nominal.ATTITUDE]), tilt), 1.0))
         self._anchor.covariance[2, 2] = INITIAL_SIGMA[-1] ** 2 if len(depths) else UNKNOWN_SIGMA[2] ** 2
         self._accepted, self._last_tag_ns = READY_AFTER, NEVER_NS
+
+    def _by_gravity(self) -> tuple[np.ndarray | None, np.ndarray]:
+        """Returns the attitude (4,), heading 0, by the latest GRAVITY_WINDOW_NS, and their readings; None where gravity cannot be told."""
+        _, gyros, accels_depths = self._history.since(self._history.first_after(self._history.newest_ns - GRAVITY_WINDOW_NS))
+        return upright(gyros, accels_depths[:, :3]), accels_depths
 
     @property
     def _has_north(self) -> bool:
@@ -300,8 +305,15 @@ class Estimator:
         self._last_tag_ns, self._last_accept_ns = pose.capture_ns, self._history.newest_ns
 
     def _refuse(self, pose: BodyPose) -> None:
-        """Counts a refused picture; after RESET_AFTER in a row starts anew from it, with what is learnt of the body (LEARNT)."""
+        """Counts a refused picture; after RESET_AFTER in a row starts anew from it, with what is learnt of the body (LEARNT).
+
+        One that contradicts gravity, as a flipped tag does, is no place to start from: a robot most of whose tags were flipped started anew
+        twice a second, never had a pose, and tumbled on its way up.
+        """
         self._rejected += 1
+        tilt, _ = self._by_gravity()
+        if tilt is not None and tilt_between(pose.q_wb, tilt) > FLIP_RAD:
+            return
         self._refused_in_row += 1
         if self._refused_in_row >= RESET_AFTER:
             learnt = self._anchor.x[LEARNT]

@@ -88,6 +88,18 @@ def test_moment_that_nobody_could_believe_is_forgotten_with_the_place(body: Body
     assert_rests(estimate, there)
 
 
+def test_flipped_tags_alone_take_no_pose_from_a_robot_at_rest_and_make_none(body: Body) -> None:
+    """The filter started from them twice a second, had no pose meanwhile, and a robot that surfaced without one tumbled."""
+    robot = Robot(body)
+    robot.rest(100)
+    flipped = multiply(Q_WB, exp(np.array([0.7, 0.0, 0.0])))
+    for _ in range(5 * RESET_AFTER):
+        estimate = robot.step(sensors(P_WB, Q_WB, tag(robot.time_ns - PERIOD)._replace(q_wb=flipped)))
+        assert estimate.ready
+    assert_rests(estimate)
+    assert estimate.rejected == 5 * RESET_AFTER
+
+
 @pytest.mark.parametrize("ticks", [20, 60, 200])
 def test_robot_that_was_seen_askew_is_upright_at_once_when_it_is_seen_well(body: Body, ticks: int) -> None:
     """Tags whose tilt contradicted gravity: biases absorbed the difference, and would tilt the following estimates."""
