@@ -5,6 +5,7 @@ import functools
 import os
 import subprocess
 import sys
+import termios
 import threading
 from typing import Any
 
@@ -114,6 +115,24 @@ class TestSlcan(PortSuite):
         closing.join(10.0)
         assert not closing.is_alive()
         assert not bus.serialPortOrig.is_open
+
+    def test_adapter_that_accepts_nothing_is_refused_instead_of_waited_for(self, cable):
+        """Regression: python-can waited for it without end: a start was deaf to Ctrl-C, and a reader that reopened it never ended."""
+        device = os.open(cable.links[0], os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK)
+        termios.tcflow(device, termios.TCOOFF)
+        refused: list[str] = []
+
+        def start() -> None:
+            try:
+                open_port(cable.addresses[0])
+            except PortError as error:
+                refused.append(str(error))
+
+        opening = threading.Thread(target=start, daemon=True)
+        opening.start()
+        opening.join(10.0)
+        os.close(device)
+        assert refused == [f"{cable.addresses[0]}: the adapter accepts nothing; unplug it and plug it in again"]
 
     def test_adapter_whose_device_fails_to_close_can_be_opened_again(self, cable, monkeypatch):
         link = SlcanLink(cable.addresses[0].removeprefix("slcan:"))

@@ -17,6 +17,7 @@ from queue import Empty, SimpleQueue
 from typing import Any, cast
 
 import can
+from can.interfaces.slcan import slcanBus
 from can.interfaces.udp_multicast import UdpMulticastBus
 from can.interfaces.virtual import VirtualBus, channels_lock
 
@@ -233,6 +234,22 @@ class SocketcanLink(Link):
             return 0
 
 
+class _SlcanBus(slcanBus):
+    """python-can's bus, but its lines are written only as far as the device accepts them at once.
+
+    python-can waits without end for a device that accepts nothing, deaf to Ctrl-C: while a port opens, also in its reader.
+    """
+
+    def _write(self, string: str) -> None:
+        line = string.encode() + self.LINE_TERMINATOR
+        try:
+            written = os.write(self.serialPortOrig.fileno(), line)
+        except OSError as error:
+            raise can.CanOperationError(str(error), error.errno) from error
+        if written < len(line):
+            raise can.CanOperationError(f"{string!r} was cut short", errno.EAGAIN)
+
+
 class SlcanLink(Link):
     """slcan:DEVICE, an adapter on a serial port."""
 
@@ -247,15 +264,15 @@ class SlcanLink(Link):
         self._rest = b""
         try:
             self._take()
-            return can.Bus(
-                interface="slcan", channel=self.address, bitrate=BIT_RATE, sleep_after_open=0.0, timeout=0.0, ignore_config=True
-            )
+            return _SlcanBus(channel=self.address, bitrate=BIT_RATE, sleep_after_open=0.0, timeout=0.0)
         except Exception as error:
             if isinstance(error, BlockingIOError) and self._lock is None:
                 raise PortError(f"slcan:{self.address}: another process uses it; one adapter serves one process") from None
             self._give_back()
             if not isinstance(error, (OSError, ValueError, can.CanError)):
                 raise
+            if error_number(error) == errno.EAGAIN:
+                raise PortError(f"slcan:{self.address}: the adapter accepts nothing; unplug it and plug it in again") from None
             hint = "it takes a serial device, slcan:/dev/ttyACM0"
             raise PortError(f"slcan:{self.address}: {_reason(error)}; {hint}") from None
 
