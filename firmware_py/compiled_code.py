@@ -12,6 +12,10 @@ from pathlib import Path
 
 CACHE_FOLDER = "NUMBA_CACHE_DIR"
 """Numba's environment variable for its cache folder; inherited by child processes."""
+_SUFFIXES = (".nbi", ".nbc")
+"""Of numba's files: an index, and compiled code."""
+_PICKLE_BEGIN, _PICKLE_END = b"\x80", b"."
+"""First and last byte of a pickle: its opcodes PROTO and STOP."""
 
 
 def caches(package: Path) -> list[Path]:
@@ -64,6 +68,25 @@ def forget_stale_code(root: Path, package: str, *used: str) -> None:
             if path.stat().st_mtime < newest:
                 path.unlink()
         except OSError:  # another process was faster, or the folder is read-only
+            pass
+
+
+def forget_torn_code(*folders: Path) -> None:
+    """Deletes numba's files below `folders` that were cut short or hold zeros at an end, as a power cut leaves those written just before.
+
+    Numba raises EOFError or UnpicklingError for such a file, at every start. Each of its files begins and ends as a pickle does.
+    """
+    for path in (Path(folder, name) for top in folders for folder, _, names in os.walk(top) for name in names):
+        if path.suffix not in _SUFFIXES:
+            continue
+        try:
+            with path.open("rb") as file:
+                begin = file.read(1)
+                file.seek(-len(begin), os.SEEK_END)
+                end = file.read(1)
+            if (begin, end) != (_PICKLE_BEGIN, _PICKLE_END):
+                path.unlink()
+        except OSError:  # as in forget_stale_code
             pass
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from firmware_py.compiled_code import CACHE_FOLDER, caches, forget_stale_code, temporary_cache_folder, transitive_sources
+from firmware_py.compiled_code import CACHE_FOLDER, caches, forget_stale_code, forget_torn_code, temporary_cache_folder, transitive_sources
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -42,6 +44,30 @@ def test_compiled_code_older_than_a_constant_that_it_holds_is_forgotten(tmp_path
     cache = cache_of(tmp_path / "mine", 250)
     forget_stale_code(tmp_path, "mine")
     assert cache.exists() == stays
+
+
+@pytest.mark.slow
+def test_start_after_a_power_cut_compiles_again_what_that_spoilt(tmp_path: Path) -> None:
+    text = "from numba import njit\n\n\n@njit('f8(f8)', cache=True)\ndef twice(x):\n    return 2.0 * x\n"
+    written(tmp_path / "mine" / "sums.py", 200, text)
+    start = [sys.executable, "-c", "import firmware_py, mine.sums"]
+    environment = {**os.environ, "PYTHONPATH": f"{ROOT}:{tmp_path}", CACHE_FOLDER: str(tmp_path / "cache")}
+    subprocess.run(start, env=environment, check=True)
+    (index,) = caches(tmp_path / "cache")
+    index.write_bytes(b"")
+    subprocess.run(start, env=environment, check=True)
+
+
+@pytest.mark.parametrize(("content", "stays"), [(b"", False), (b"\x80\x04N", False), (bytes(4), False), (b"\x80\x04N.", True)])
+@pytest.mark.parametrize("name", ["sums.run-3.py311.nbi", "sums.run-3.py311.1.nbc"])
+def test_compiled_code_that_is_cut_short_or_zeros_is_forgotten(tmp_path: Path, name: str, content: bytes, stays: bool) -> None:
+    path = tmp_path / "__pycache__" / name
+    path.parent.mkdir()
+    path.write_bytes(content)
+    source = written(tmp_path / "sums.py", 200)
+    forget_torn_code(tmp_path, tmp_path / "absent")
+    assert path.exists() == stays
+    assert source.exists()
 
 
 def test_the_constants_of_the_wire_are_among_what_is_compiled() -> None:
