@@ -2,14 +2,25 @@
 
 from __future__ import annotations
 
+import os
+import struct
+from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
-from mcap.records import Channel, Chunk, Message, MessageIndex
-from mcap.stream_reader import StreamReader, breakup_chunk
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, McapRecord, Message
+from mcap.stream_reader import breakup_chunk
 
-from firmware_py.description.signals import SPOILT, Layout
+from firmware_py.description.signals import MCAP_MAGIC, SPOILT, Layout
 from firmware_py.runtime.tick_messages import BODY, body_signals
+
+_HEAD = struct.Struct("<BQH")
+"""Opcode and length of a record (MCAP specification), and the first two bytes of its content."""
+_LEAST = 9
+"""Bytes before the content of a record."""
 
 
 class BodyEnd(NamedTuple):
@@ -30,29 +41,59 @@ def last_bodies(path: Path) -> dict[int, BodyEnd]:
 
 
 def _last_messages(path: Path) -> dict[str, bytes]:
-    """The last message of each topic. Of the chunks of the log, only those are opened in which a channel begins or ends."""
+    """The last message of each topic. Of the chunks of the log, only those are read in which a channel begins or ends."""
     topics: dict[int, str] = {}
-    last: dict[int, Chunk] = {}
-    """By channel."""
-    chunk: Chunk | None = None
+    last: dict[int, _Record] = {}
+    """Chunk by channel."""
+    chunk: _Record | None = None
     with path.open("rb") as file:
-        try:
-            for record in StreamReader(file, emit_chunks=True).records:
-                if isinstance(record, Chunk):
-                    chunk = record
-                elif isinstance(record, MessageIndex) and chunk is not None:
-                    if record.channel_id not in topics:
-                        begun = {each.id: each.topic for each in breakup_chunk(chunk, True) if isinstance(each, Channel)}
-                        topics |= {record.channel_id: "", **begun}
-                    last[record.channel_id] = chunk
-        except SPOILT:
-            pass  # truncated: the records before stay valid
-    return {topics[channel]: data for channel, each in last.items() if channel in topics for data in _messages(each, channel)[-1:]}
+        for record in _records(file.fileno()):
+            if record.opcode == Opcode.CHUNK:
+                chunk = record
+            elif record.opcode == Opcode.MESSAGE_INDEX and chunk is not None:
+                if record.channel not in topics:
+                    begun = {each.id: each.topic for each in _contents(file.fileno(), chunk) if isinstance(each, Channel)}
+                    topics |= {record.channel: "", **begun}
+                last[record.channel] = chunk
+        return {topics[channel]: data for channel, each in last.items() for data in _messages(file.fileno(), each, channel)[-1:]}
 
 
-def _messages(chunk: Chunk, channel: int) -> list[bytes]:
-    """The messages of a channel in a chunk; none if it is damaged."""
+class _Record(NamedTuple):
+    """A record of a log, not read yet."""
+
+    opcode: int
+    begin: int
+    """Byte at which its content begins."""
+    length: int
+    channel: int
+    """Of a message index; of another record its first two bytes."""
+
+
+def _records(file: int) -> Iterator[_Record]:
+    """The records of an open log, up to its end or to the point of truncation. Only their heads are read: a flight leaves 300 MB an hour
+    and module, for which a vehicle that restarts in flight cannot wait.
+    """
+    size, at = os.fstat(file).st_size, len(MCAP_MAGIC)
+    if os.pread(file, at, 0) != MCAP_MAGIC:
+        return
+    while len(head := os.pread(file, _HEAD.size, at)) == _HEAD.size:
+        opcode, length, channel = _HEAD.unpack(head)
+        begin = at + _LEAST
+        at = begin + length
+        if not opcode or at > size:  # zeros that a power cut left, or a truncated record
+            return
+        yield _Record(opcode, begin, length, channel)
+
+
+def _contents(file: int, chunk: _Record) -> list[McapRecord]:
+    """The records in a chunk; none if it is damaged."""
     try:
-        return [each.data for each in breakup_chunk(chunk, True) if isinstance(each, Message) and each.channel_id == channel]
+        stream = ReadDataStream(BytesIO(os.pread(file, chunk.length, chunk.begin)))
+        return breakup_chunk(Chunk.read(stream), True)
     except SPOILT:
         return []
+
+
+def _messages(file: int, chunk: _Record, channel: int) -> list[bytes]:
+    """The messages of a channel in a chunk."""
+    return [each.data for each in _contents(file, chunk) if isinstance(each, Message) and each.channel_id == channel]

@@ -1,15 +1,20 @@
 """A process that was killed during a motor test: the vehicle may lie on a bench, so the next process does not fly it."""
 
 import dataclasses
+import os
+import struct
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from mcap.opcode import Opcode
 
 from firmware_py.app.firmware import compose
 from firmware_py.app.last_flight import TESTED, last_flight, to_arm
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters, Supervision
+from firmware_py.description.signals import MCAP_MAGIC
 from firmware_py.runtime.clock import boot_id, unix_ns
 from firmware_py.runtime.log_end import BodyEnd, last_bodies
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
@@ -77,6 +82,32 @@ def test_bodies_of_the_last_tick_alone_count(tmp_path: Path) -> None:
     """Body 1 has docked to body 0 since its motor test; a channel that begins late is found too."""
     write_log(tmp_path, {1: (ARMED, Mode.MOTOR_DETECT)}, *[{0: (ARMED, Mode.AUTO), 2: (ARMED, Mode.SURFACE)}] * 50)
     assert last_bodies(tmp_path / SIGNAL_LOG) == {0: BodyEnd(ARMED, int(Mode.AUTO)), 2: BodyEnd(ARMED, int(Mode.SURFACE))}
+
+
+RECORD = struct.Struct("<BQ")
+"""Opcode and length of a record (MCAP specification)."""
+
+
+def chunks_in(log: bytes) -> Iterator[int]:
+    """Byte at which each chunk of a log begins."""
+    at = len(MCAP_MAGIC)
+    while at + RECORD.size <= len(log):
+        opcode, length = RECORD.unpack_from(log, at)
+        if opcode == Opcode.CHUNK:
+            yield at
+        at += RECORD.size + length
+
+
+def test_chunks_between_the_ends_of_a_log_are_not_read(tmp_path: Path) -> None:
+    """A vehicle that restarts in flight waited a second for each hour of its log. Here 8 GB are a hole in the file."""
+    write_log(tmp_path, {0: (ARMED, Mode.AUTO)}, {0: (ARMED, Mode.MOTOR_DETECT)})
+    whole, hole = (tmp_path / SIGNAL_LOG).read_bytes(), 8 << 30
+    _, second, *_ = chunks_in(whole)
+    with (tmp_path / SIGNAL_LOG).open("wb") as file:
+        file.write(whole[:second] + RECORD.pack(Opcode.CHUNK, hole))
+        file.seek(hole, os.SEEK_CUR)
+        file.write(whole[second:])
+    assert last_bodies(tmp_path / SIGNAL_LOG) == {0: BodyEnd(ARMED, int(Mode.MOTOR_DETECT))}
 
 
 @pytest.mark.parametrize("cut", [1, 40, 300, 1000])
