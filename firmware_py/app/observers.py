@@ -32,12 +32,13 @@ def event_line(time_ns: int, event: Event) -> str:
 def recording(recorder: Recorder, rate_hz: int) -> Observer:
     """An observer that writes every tick to `recorder`, in the order in which frames went over the bus.
 
-    Flushes at once when a module arms or disarms, so that a restart after a kill knows which modules were armed.
+    Flushes at once when a module arms or disarms, so that a restart after a kill knows which modules were armed. If `recorder` raises, the
+    log ends: the loop goes on without this observer, and the next process must not take the last tick in the log for the end of the flight.
     """
     flush_every = max(1, round(FLUSH_EVERY_S * rate_hz))
     was_armed: list[bool] = []
 
-    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+    def record(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
         buses = sorted({bus for bus, _ in sent})
         syncs = len(buses)
         for bus in buses:
@@ -49,6 +50,13 @@ def recording(recorder: Recorder, rate_hz: int) -> Observer:
         if armed != was_armed or outputs.tick % flush_every == 0:
             was_armed[:] = armed
             outputs.events += recorder.flush()
+
+    def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        try:
+            record(received, sent, inputs, outputs)
+        except Exception:
+            recorder.give_up()
+            raise
 
     return observe
 

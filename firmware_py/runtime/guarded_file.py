@@ -67,6 +67,12 @@ class GuardedFile:
                 self.error = error
                 self._date_back()
 
+    def give_up(self) -> None:
+        """Ends the file here, as an error of the disk does, for a writer that fails otherwise."""
+        if self.error is None:
+            self.error = OSError(errno.ECANCELED, os.strerror(errno.ECANCELED))
+            self._date_back()
+
     def _to_disk(self) -> None:
         if self._file is not None:
             os.fsync(self._file.fileno())

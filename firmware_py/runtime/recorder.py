@@ -194,6 +194,14 @@ class Recorder:
             file.sync()
         return self._failure()
 
+    def give_up(self) -> None:
+        """Ends both files before their flight, without a further warning, after a call has raised: what follows is missing in them."""
+        for pending in (self._frames, self._ticks, self._lines):
+            pending.clear()
+        self._reported = True
+        for file in (self._can, self._mcap):
+            file.give_up()
+
     def check(self) -> None:
         """Raises the OSError of a file that has failed, for callers that need the log."""
         for file in (self._can, self._mcap):

@@ -1,6 +1,7 @@
 """A vehicle's process that was killed in flight holds again, but arms no body whose joints may have changed."""
 
 import dataclasses
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -9,10 +10,12 @@ import pytest
 
 from firmware_py.app import vehicle_process
 from firmware_py.app.operator import Operator
+from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters, Supervision
 from firmware_py.runtime.clock import boot_id
 from firmware_py.runtime.recorder import CAN_LOG, Recorder
+from firmware_py.runtime.tick_messages import Message, TickMessages
 from tests.unit.can_logs import FLEET, dock_line, lines_of
 from tests.unit.vehicle_runs import bus_of, fly
 
@@ -34,6 +37,25 @@ def test_process_killed_in_flight_holds_again_where_a_parameter_says_so(tmp_path
     assert HOLDS in fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet)
     assert (tmp_path / "log" / "0002" / CAN_LOG).exists()
     assert HOLDS not in fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet)  # 0002 ended disarmed
+
+
+@pytest.mark.slow
+def test_flight_whose_recorder_failed_before_its_end_is_not_taken_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: its log ended with commands to armed modules, a moment ago, although they were disarmed since."""
+    fleet = write_log_killed_in_flight(tmp_path)
+    of = TickMessages.of
+
+    def fail(messages: TickMessages, received: int, inputs: Inputs, outputs: Outputs) -> Iterator[Message]:
+        if outputs.tick == 2:
+            raise MemoryError
+        return of(messages, received, inputs, outputs)
+
+    with monkeypatch.context() as failing:
+        failing.setattr(TickMessages, "of", fail)
+        said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet)
+    assert HOLDS in said and any(line.endswith("no more recording: MemoryError: ") for line in said)
+    torn = tmp_path / "log" / "0002" / CAN_LOG
+    assert torn.stat().st_mtime == 0.0 and " T\n" in torn.read_text()
 
 
 @pytest.mark.slow
