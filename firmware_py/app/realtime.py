@@ -39,6 +39,8 @@ class RealTimeLoop:
     unanswered: int = 0
     last: Outputs | None = None
     _received: list[BusFrame] = field(default_factory=list)
+    _skipped: int = 0
+    """Deadlines that were skipped before the last tick."""
 
     def listen(self) -> None:
         """Listens before the first SYNC and discards what it received. Raises PortError when another node sends SYNC."""
@@ -66,7 +68,7 @@ class RealTimeLoop:
         sync = self.firmware.sync(tick, time_ns)
         self._send(sync)
         collector = self.firmware.collector
-        close_ns = time_ns + self.firmware.fleet.period_ns // 2
+        close_ns = self._answers_from(time_ns) + self.firmware.fleet.period_ns // 2
         in_time = self.ports[0].wait(close_ns, lambda: self._take() and collector.all_answered(tick))
         self.unanswered += not in_time
         received, self._received = self._received, []
@@ -77,6 +79,13 @@ class RealTimeLoop:
         self._show(received, sync + frames, inputs, outputs)
         self.last = outputs
         return outputs
+
+    def _answers_from(self, time_ns: int) -> int:
+        """When the modules' time to answer begins: with the tick, or with its SYNC if the process was held up. Such a tick starts up to a
+        period late, and would close without any answer, as if modules and sensors had been lost.
+        """
+        before, self._skipped = self._skipped, self.rate_keeper.skipped
+        return time_ns if self._skipped == before else self.clock.now_ns()
 
     def _show(self, received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
         """Calls every observer; drops one that raises, because the flight matters more."""

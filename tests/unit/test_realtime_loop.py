@@ -1,8 +1,9 @@
 """Ticks in real time: they go on when an observer fails."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
@@ -17,6 +18,7 @@ from firmware_py.description.fleet import single
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.signals import read_signals
 from firmware_py.runtime.flight_log import FlightLog
+from firmware_py.runtime.rate_keeper import RateKeeper
 from firmware_py.runtime.recorder import SIGNAL_LOG, Recorder
 
 
@@ -29,6 +31,46 @@ def firmware(tmp_path: Path) -> Firmware:
 def loop(firmware: Firmware) -> Iterator[RealTimeLoop]:
     with ExitStack() as stack:
         yield open_loop(stack, firmware, lambda time_ns, last: [])
+
+
+class SilentPort:
+    """A bus where nobody answers; notes until when the loop waited."""
+
+    def __init__(self) -> None:
+        self.waited_ns: list[int] = []
+
+    def send(self, frame: Frame) -> bool:
+        return True
+
+    def receive(self) -> list[Frame]:
+        return []
+
+    def wait(self, deadline_ns: int, ready: Callable[[], bool]) -> bool:
+        self.waited_ns.append(deadline_ns)
+        return ready()
+
+
+class HandClock:
+    """A clock that is set by hand, and by who sleeps."""
+
+    now = 0
+
+    def now_ns(self) -> int:
+        return self.now
+
+    def sleep_until(self, deadline_ns: int) -> None:
+        self.now = deadline_ns
+
+
+def test_modules_have_their_time_to_answer_also_in_the_first_tick_after_the_process_was_held_up(firmware: Firmware) -> None:
+    """Regression: it closed before its SYNC was out in every other case, all sensors counted as lost, and the robot surfaced."""
+    clock, port = HandClock(), SilentPort()
+    keeper = RateKeeper(firmware.fleet.period_ns, clock, clock.sleep_until)
+    loop = RealTimeLoop(firmware, cast(Any, [port]), cast(Any, clock), keeper, lambda time_ns, last: [])
+    for tick, (now_ms, closes_ms) in enumerate([(0, 5), (3, 15), (22, 25), (827, 832), (828, 835)], 1):
+        clock.now = now_ms * 1_000_000
+        loop.tick(tick, keeper.wait())
+        assert port.waited_ns[-1] == closes_ms * 1_000_000
 
 
 def breaking(at_tick: int) -> Observer:
