@@ -91,7 +91,8 @@ def last_flight(out: Path, fleet: Fleet, codec: Codec, now_ns: int, boot: str) -
         if sent is None:
             break
         if sent:
-            return _told(sent, _notes_of(folder), fleet, codec, boot)._replace(stopped=stopped, grounded=_grounded(folder))
+            told = _told(sent, _notes_of(folder), fleet, codec, boot)._replace(stopped=stopped, grounded=_grounded(folder))
+            return told._replace(armed=frozenset()) if _is_dated_back(folder / SIGNAL_LOG) else told
     return LastFlight(stopped=stopped)
 
 
@@ -105,6 +106,14 @@ def outdate(out: Path, now_ns: int) -> None:
 
 def _is_recent(status: os.stat_result, now_ns: int) -> bool:
     return 0 <= now_ns - status.st_mtime_ns < RECENT_NS
+
+
+def _is_dated_back(path: Path) -> bool:
+    """Whether a log file was ended before its flight by an error (runtime.guarded_file), although the other may go on to its end."""
+    try:
+        return path.stat().st_mtime_ns == 0
+    except OSError:
+        return False
 
 
 def to_arm(before: LastFlight, firmware: Firmware, hold: bool, say: Callable[[str], None]) -> set[int]:

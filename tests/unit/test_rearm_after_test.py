@@ -1,6 +1,7 @@
 """A process that was killed during a motor test: the vehicle may lie on a bench, so the next process does not fly it."""
 
 import dataclasses
+import errno
 import os
 import struct
 from collections.abc import Iterator
@@ -16,6 +17,7 @@ from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters, Supervision
 from firmware_py.description.signals import MCAP_MAGIC
 from firmware_py.runtime.clock import boot_id, unix_ns
+from firmware_py.runtime.guarded_file import GuardedFile
 from firmware_py.runtime.log_end import BodyEnd, last_bodies
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
 from tests.unit.can_logs import CODEC, FLEET, lines_of
@@ -27,8 +29,8 @@ Told = dict[int, tuple[int, Mode]]
 """State and mode of each body in one tick."""
 
 
-def write_log(folder: Path, *ticks: Told) -> None:
-    """Writes the log of a process with these records, which was killed after thruster commands to armed modules."""
+def write_log(folder: Path, *ticks: Told, killed: bool = True) -> None:
+    """Writes the log of a process with these records, which ended, or was killed, after thruster commands to armed modules."""
     folder.mkdir(exist_ok=True)
     recorder = Recorder(folder, {"boot": boot_id()})
     robot = Robot(3)
@@ -40,7 +42,8 @@ def write_log(folder: Path, *ticks: Told) -> None:
         recorder.flush()
     signals = (folder / SIGNAL_LOG).read_bytes()
     recorder.close()
-    (folder / SIGNAL_LOG).write_bytes(signals)
+    if killed:
+        (folder / SIGNAL_LOG).write_bytes(signals)
     (folder / CAN_LOG).write_text(lines_of([True] * 3))
 
 
@@ -75,6 +78,21 @@ def test_body_that_flew_on_after_its_motor_test_is_armed_again(tmp_path: Path) -
 def test_log_whose_signals_end_before_the_body_was_armed_arms_nobody(tmp_path: Path) -> None:
     """The two files are not written at one moment: the signals may lack the motor test that armed it."""
     write_log(tmp_path, dict.fromkeys(range(3), (DISARMED, Mode.POSHOLD)))
+    assert rearmed(tmp_path)[0] == set()
+
+
+def test_log_of_which_only_the_signals_ended_before_the_flight_arms_nobody(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are the larger file: on a memory stick (FAT) it ends at 4 GB, and can.log goes on. The motor test came after."""
+    append = GuardedFile._append
+
+    def append_until_too_large(file: GuardedFile, data: bytes) -> None:
+        if file.path.name == SIGNAL_LOG and file.seek(0) > 20_000:
+            raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+        append(file, data)
+
+    monkeypatch.setattr(GuardedFile, "_append", append_until_too_large)
+    flies, tests = (dict.fromkeys(range(3), (ARMED, mode)) for mode in (Mode.POSHOLD, Mode.MOTOR_DETECT))
+    write_log(tmp_path, *[flies] * 50, *[tests] * 50, killed=False)
     assert rearmed(tmp_path)[0] == set()
 
 
