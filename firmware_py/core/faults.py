@@ -2,7 +2,8 @@
 and supervisor.
 
 A thruster that was found faulty stays excluded until the body is disarmed, unless leaving it out shows that something else pushes
-(`thruster_trial`); those of a silent module stay excluded until it is heard again.
+(`thruster_trial`), or it was its ESC that failed and is well again, as after a sag of the supply. Those of a silent module stay excluded
+until it is heard again.
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.body import Body, rank_by, rank_of
+from firmware_py.core.command_watch import CommandWatch
 from firmware_py.core.missing_thrust import MissingThrust
 from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import polynomial
 from firmware_py.core.thruster_names import name_of, places_of
 from firmware_py.core.topology import in_both
-from firmware_py.core.types import MCU_TIMED_OUT, Estimate, Measured, ModuleInputs
+from firmware_py.core.types import Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 
 ESC_DOWN = (1, 3)
@@ -48,9 +50,8 @@ SILENT_NS = 500_000_000
 """Silence after which a module's thrusters are excluded, if the others can make every wrench without them; the fail-safe `module_silent`
 acts then too. A module that hears nothing either has stopped its thrusters after 100 ms (DESIGN's bus); one that still hears stops them
 because of the exclusion."""
-DEAF_NS = 300_000_000
-"""How long a module counts as deaf after it last reported that it hears no commands: four lags, until its propellers turn again. Meanwhile
-a standstill is no fault of its thrusters; the module counts as silent."""
+WELL_AGAIN = 10
+"""Feedbacks in a row without a fault, one second's, after which a thruster whose ESC had failed is used again."""
 BELIEVED_NS = 500_000_000
 """How long believed forces are kept: the feedback of a module whose answers come late is compared with those of its own time. Against the
 present ones, propellers that reverse seemed to disobey where frames were 30 ms late each way."""
@@ -120,9 +121,9 @@ class FaultDetector:
         """Ticks that each module has been silent; counts down again while an excluded module is heard."""
         self._silent: list[int] = []
         """Modules, by place in the body, whose thrusters are left out because of their silence."""
-        self._deaf_ticks = max(1, DEAF_NS // period_ns)
-        self._deaf = [0] * len(body.modules)
-        """Ticks for which each module goes on counting as deaf."""
+        self._watches = [CommandWatch(period_ns) for _ in body.modules]
+        self._well: dict[int, int] = {}
+        """Feedbacks in a row without a fault of each thruster that is left out because its ESC had failed."""
         self._believed: deque[np.ndarray] = deque(maxlen=max(1, BELIEVED_NS // period_ns))
         """Believed forces (n,) of the latest ticks, N."""
         self._late_ticks = [0] * len(body.modules)
@@ -149,11 +150,12 @@ class FaultDetector:
         for other in before:
             for i, j in in_both(self._modules, other._modules):
                 self._silence[i] = other._silence[j]
-                self._deaf[i] = other._deaf[j]
+                self._watches[i] = other._watches[j]
                 self._silent += [i] if j in other._silent else []
                 for channel, thruster in self._thruster_at[i].items():
                     number = other._thruster_at[j][channel]
                     self._obeys[thruster] = other._obeys[number]
+                    self._well |= {thruster: other._well[number]} if number in other._well else {}
                     self._motion.inherit(thruster, other._motion, number)
         self._motion.take_over([other._motion for other in before])
         self.now = self._usable_state()
@@ -163,7 +165,7 @@ class FaultDetector:
         self._counts[:] = 0
         self._motion.reset()
         self.changed = not self.now.alive.all()
-        self._obeys[:], self._silent = True, []
+        self._obeys[:], self._silent, self._well = True, [], {}
         self.now = self._state_for(self._obeys)
 
     def step(
@@ -188,15 +190,15 @@ class FaultDetector:
         self.words, self.changed = [], False
         own = [modules[m] for m in self._modules]
         for i, module in enumerate(own):
-            self._deaf[i] = self._deaf_ticks if module.mcu_state == MCU_TIMED_OUT else max(0, self._deaf[i] - 1)
+            self._watches[i].step(module)
             self._late_ticks[i] = self._late_ticks[i] if module.mcu_state is None else module.late_ticks
         self._believed.append(force_n)
-        free = free and not any(self._deaf)
+        free = free and not any(watch.stopped for watch in self._watches)
         found = self._motion.step(measured, estimate, mean_n * self._reported_share, self.now.alive, armed, free)
         if found is not None:
             self._lose(found, "does not push as it says")
         elif self._motion.acquitted is not None:
-            self._take_back(self._motion.acquitted)
+            self._use_again(self._motion.acquitted, "the robot is pushed as much without it")
         (self._judge_feedback if armed else self._judge_at_rest)(own, self._believed_at_answers())
         self._judge_silence(own, armed)
         return self.now
@@ -213,7 +215,7 @@ class FaultDetector:
         """Excludes the thrusters of modules that have fallen silent or deaf; re-admits them once a module has been well for as long."""
         before = self._silent
         for i, module in enumerate(modules):
-            if not module.heard or self._deaf[i]:
+            if not module.heard or self._watches[i].deaf:
                 self._silence[i] = min(self._silence[i] + 1, self._silent_after)
             elif self._silence[i]:
                 self._silence[i] = self._silence[i] - 1 if i in before else 0
@@ -221,7 +223,7 @@ class FaultDetector:
         self._silent = quiet if armed else []
         if self._silent == before:
             return
-        deaf = [str(self._modules[i]) for i in self._silent if self._deaf[i] and i not in before]
+        deaf = [str(self._modules[i]) for i in self._silent if self._watches[i].deaf and i not in before]
         self.words += [f"module {', '.join(deaf)} does not hear its commands: its thrusters stop"] if deaf else []
         alive, self.now = self.now.alive, self._usable_state()
         if not np.array_equal(alive, self.now.alive):
@@ -253,12 +255,29 @@ class FaultDetector:
         full, limits = (self._full_n, self._t.rpm_at_full), (*self._limits, self._needed)
         state = (self._counts, self._feedback_means, self._reported_share)
         found = count_feedback(feedback, force_n, self.now.alive, *full, *limits, *state)
-        if any(self._deaf):
-            self._counts[np.isin(self._t.module, np.flatnonzero(self._deaf))] = 0
+        stopped = [i for i, watch in enumerate(self._watches) if watch.stopped]
+        if stopped:
+            self._counts[np.isin(self._t.module, stopped)] = 0
         if found:
             for i, kind in np.argwhere(self._counts >= self._needed).tolist():
                 if self.now.alive[i]:
                     self._lose(i, WHY[kind])
+                    self._well |= {i: 0} if kind == ESC_FAILED else {}
+        if self._well:
+            self._hear_from_failed(feedback)
+
+    def _hear_from_failed(self, feedback: np.ndarray) -> None:
+        """Uses a thruster again whose ESC had failed and is well again: a supply that sags for a moment takes all ESCs of a module with it.
+
+        Args:
+            feedback: (k, 3, 2) as for `count_feedback`.
+        """
+        for i, _, status in feedback.transpose(0, 2, 1).reshape(-1, 3).astype(int).tolist():
+            if i in self._well:
+                self._well[i] = 0 if status in ESC_DOWN else self._well[i] + 1
+                if self._well[i] >= WELL_AGAIN:
+                    del self._well[i]
+                    self._use_again(i, "its ESC is well again")
 
     def _judge_at_rest(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
         """Warns of a propeller that turns while disarmed: somebody may be about to reach for it."""
@@ -285,12 +304,11 @@ class FaultDetector:
         self._motion.forget()
         self.words.append(f"{self._names[i]} {why}: left out")
 
-    def _take_back(self, i: int) -> None:
-        """Uses a thruster again that the motion alone had convicted."""
-        self._obeys[i] = True
+    def _use_again(self, i: int, why: str) -> None:
+        self._obeys[i], self._counts[i] = True, 0
         self.now, self.changed = self._usable_state(), True
         self._motion.forget()
-        self.words.append(f"{self._names[i]} is used again: the robot is pushed as much without it")
+        self.words.append(f"{self._names[i]} is used again: {why}")
 
     def _state_for(self, usable: np.ndarray) -> ThrusterFaults:
         alive = usable.copy()
@@ -337,13 +355,15 @@ def count_feedback(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_
             means[i, 0] += FEEDBACK_WEIGHT * (given * asked - means[i, 0])
             means[i, 1] += FEEDBACK_WEIGHT * (asked * asked - means[i, 1])
             share[i] = min(1.0, max(0.0, means[i, 0] / means[i, 1])) if means[i, 1] > 0.0 else 1.0
-            stands = abs(rpm) < dead_share * abs(believed)
+            failed = status in ESC_DOWN  # which explains any speed
+            stands = abs(rpm) < dead_share * abs(believed) and not failed
             wrong_way = rpm * believed < 0.0 and not stands and abs(rpm - believed) > margin
-            count[ESC_FAILED] = count[ESC_FAILED] + 1 if status in ESC_DOWN else 0
+            too_fast = abs(rpm) > FAST_SHARE * abs(believed) + margin
+            count[ESC_FAILED] = count[ESC_FAILED] + 1 if failed else 0
             if abs(force_n[i]) >= least_n[i]:
                 step = 2 if count[STALLED] > 0 and abs(force_n[i]) >= CLEAR * least_n[i] else 1
                 count[STALLED] = count[STALLED] + step if stands else 0
-            count[WRONG_SPEED] = count[WRONG_SPEED] + 1 if wrong_way or abs(rpm) > FAST_SHARE * abs(believed) + margin else 0
+            count[WRONG_SPEED] = count[WRONG_SPEED] + 1 if (wrong_way or too_fast) and not failed else 0
             for kind in range(len(WHY)):
                 found = found or count[kind] >= needed[kind]
     return found

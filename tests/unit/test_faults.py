@@ -56,6 +56,27 @@ def test_three_reports_of_a_failed_esc_in_a_row_are_enough_and_two_are_not(water
     assert [words for _, words in water.run(0.3)] == ["thruster 7 of module 0 has an ESC that failed: left out"]
 
 
+def test_thrusters_of_escs_that_a_sagging_supply_took_along_are_used_again_once_they_are_well(water: Water) -> None:
+    """A module alone lost all its thrusters for good by half a second without power."""
+    water.run(1.0)
+    water.status[:], water.speed_factor[:] = 3, 0.0
+    assert len(water.run(0.5)) == 8 and not water.detector.now.alive.any()
+    water.status[:], water.speed_factor[:] = 0, 1.0
+    assert water.run(0.85) == []
+    assert {words for _, words in water.run(0.3)} == {f"thruster {n} of module 0 is used again: its ESC is well again" for n in range(1, 9)}
+    assert water.detector.now.alive.all() and water.run(1.0) == []
+
+
+def test_esc_that_fails_again_and_again_stays_left_out(water: Water) -> None:
+    water.run(1.0)
+    water.status[6] = 1
+    assert len(water.run(0.5)) == 1
+    for _ in range(5):
+        for status, seconds in ((0, 0.8), (1, 0.2)):
+            water.status[6] = status
+            assert water.run(seconds) == []
+
+
 def test_hot_esc_is_no_failure(water: Water) -> None:
     water.status[6] = 2
     water.fly(2.0)

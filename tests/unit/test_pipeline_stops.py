@@ -122,7 +122,7 @@ def test_warning_of_a_lost_thruster_ends_in_flight_once_the_thruster_is_acquitte
     pipeline.faults._lose(3, "does not push as it says")
     tank.run(5.0)
     assert pipeline.supervisor.is_on("thruster_lost")
-    pipeline.faults._take_back(3)
+    pipeline.faults._use_again(3, "the robot is pushed as much without it")
     tank.run(1.9)
     assert pipeline.supervisor.is_on("thruster_lost")
     tank.run(0.2)

@@ -3,13 +3,16 @@
 import numpy as np
 
 from firmware_py.core.faults import FaultDetector
-from firmware_py.core.types import MCU_TIMED_OUT, EscFeedback, Estimate, Measured, ModuleInputs
+from firmware_py.core.types import CHANNELS, MCU_TIMED_OUT, EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 TICK_NS, DT = 10_000_000, 0.01
 ZERO = np.zeros(3)
+AT_REST = Estimate(ZERO, np.eye(1, 4)[0], np.zeros(6), ZERO, ZERO, ZERO, ZERO, 0, 1.0, 6, 0, True)
+ARMED = 2
+"""MCU_STATUS state."""
 
 
 class DetectorRig:
@@ -29,9 +32,8 @@ class DetectorRig:
         modules = [ModuleInputs(heard=m in heard, mcu_state=MCU_TIMED_OUT if m == deaf else None) for m in range(len(self.body.modules))]
         for module in modules:
             module.esc = [EscFeedback(first, (0.0, 0.0), (0.0, 0.0), (0, 0)) for first in range(0, 8, 2)] if force_n else []
-        estimate = Estimate(ZERO, np.eye(1, 4)[0], np.zeros(6), ZERO, ZERO, ZERO, ZERO, 0, 1.0, 6, 0, True)
         for _ in range(round(seconds / DT)):
-            self.detector.step(modules, Measured(None, None, None, []), estimate, np.full(n, force_n), np.full(n, force_n), armed, True)
+            self.detector.step(modules, Measured(None, None, None, []), AT_REST, np.full(n, force_n), np.full(n, force_n), armed, True)
             assert self.detector.changed == any("left out" in words or "again" in words for words in self.detector.words)
             said += self.detector.words
         return said
@@ -110,3 +112,50 @@ def test_thrusters_of_a_module_that_hears_no_commands_are_left_out_until_it_does
     assert said == ["module 1 does not hear its commands: its thrusters stop", "thrusters of silent module 1 are left out"]
     assert rig.used == {0}
     assert rig.run(1.0, 0, 1) == ["thrusters of every module are used again"] and rig.used == {0, 1}
+
+
+class PushingRig(DetectorRig):
+    """One module whose thrusters push; it reports ten times a second that they turn as they should, or that they stand still."""
+
+    def __init__(self) -> None:
+        super().__init__(1)
+        self.force_n = np.full(self.body.thrusters.f_max.size, 2.0)
+        self.tick = 0
+
+    def hear(self, seconds: float, turns: bool, reports: int = 1, mcu_state: int = ARMED) -> list[str]:
+        """Runs the detector, with so many reports of each ESC every tenth of a second; returns its messages."""
+        said: list[str] = []
+        for _ in range(round(seconds / DT)):
+            self.tick += 1
+            due = range(0, CHANNELS, 2) if self.tick % 10 == 0 else ()
+            esc = [self._report(first, turns) for first in due for _ in range(reports)]
+            module = ModuleInputs(heard=True, mcu_state=mcu_state, esc=esc)
+            self.detector.step([module], Measured(None, None, None, []), AT_REST, self.force_n, self.force_n, True, True)
+            said += self.detector.words
+        return said
+
+    def _report(self, first: int, turns: bool) -> EscFeedback:
+        a, b = (self.detector.believed_rpm(i, self.force_n[i]) if turns else 0.0 for i in (first, first + 1))
+        return EscFeedback(first, (a, b), (0.5, 0.5), (0, 0))
+
+
+def test_thrusters_that_a_module_stopped_while_its_bus_was_interrupted_are_not_found_dead() -> None:
+    """Regression: a bus that was held up for 0.3 s kept commands and answers and delivered them in a burst: all answers of propellers that
+    stood still, as a module stops them after 0.1 s without commands. Eight healthy thrusters were left out for the rest of the flight."""
+    rig = PushingRig()
+    assert rig.hear(1.0, turns=True) == [] == rig.run(0.3)
+    assert rig.hear(0.1, turns=False, reports=3) == [] == rig.hear(0.2, turns=False) == rig.hear(1.0, turns=True)
+    assert rig.used == {0}
+
+
+def test_thrusters_that_a_module_stopped_while_this_process_was_held_up_are_not_found_dead() -> None:
+    """The module was not silent, as far as this process knows, but it says that it missed commands."""
+    rig = PushingRig()
+    assert rig.hear(1.0, turns=True) == [] == rig.hear(DT, turns=False, mcu_state=MCU_TIMED_OUT)
+    assert rig.hear(0.3, turns=False) == [] == rig.hear(1.0, turns=True)
+
+
+def test_thruster_that_stands_still_after_an_interruption_of_the_bus_is_found() -> None:
+    rig = PushingRig()
+    assert rig.hear(1.0, turns=True) == [] == rig.run(0.3)
+    assert "thruster 1 of module 0 stands still: left out" in rig.hear(0.8, turns=False)

@@ -31,7 +31,7 @@ def test_thrusters_count_from_one_in_each_module(pair: Body) -> None:
 def test_fault_names_the_module_and_the_thruster_there(pair: Body) -> None:
     detector = FaultDetector(pair, Faults(), TICK_NS)
     detector._lose(11, WHY[STALLED])
-    detector._take_back(11)
+    detector._use_again(11, "the robot is pushed as much without it")
     said = [words.partition(":")[0] for words in detector.words]
     assert said == ["thruster 4 of module 2 stands still", "thruster 4 of module 2 is used again"]
     detector.words.clear()

@@ -1,0 +1,40 @@
+"""Whether a module hears its commands. Without them its microcontroller stops its thrusters: a standstill is no fault of theirs then."""
+
+from __future__ import annotations
+
+from firmware_py.core.types import MCU_TIMED_OUT, ModuleInputs
+
+STOPPED_NS = 100_000_000
+"""Silence after which a module may have stopped its thrusters: it may hear no commands either (DESIGN's bus)."""
+START_NS = 300_000_000
+"""How long propellers that were stopped may stand still: four lags. A bus that was interrupted may first deliver in a burst the commands
+and the answers that it kept, all of propellers that stood still."""
+
+
+class CommandWatch:
+    """Watches one module."""
+
+    def __init__(self, period_ns: int) -> None:
+        self._stopped_after, self._start_ticks = max(1, STOPPED_NS // period_ns), max(1, START_NS // period_ns)
+        self._unheard = 0
+        """Ticks in a row in which the module was not heard."""
+        self._deaf = self._starting = 0
+        """Ticks for which it goes on counting as deaf, and as stopped."""
+
+    @property
+    def deaf(self) -> bool:
+        """Whether it reports that it hears no commands, or did until just now."""
+        return self._deaf > 0
+
+    @property
+    def stopped(self) -> bool:
+        """Whether its propellers may stand still for want of commands, or just start again: it is deaf, or was silent until just now."""
+        return self._starting > 0
+
+    def step(self, module: ModuleInputs) -> None:
+        """Takes what came from the module since the previous tick."""
+        timed_out = module.mcu_state == MCU_TIMED_OUT
+        returns = module.heard and self._unheard >= self._stopped_after
+        self._deaf = self._start_ticks if timed_out else max(0, self._deaf - 1)
+        self._starting = self._start_ticks if timed_out or returns else max(0, self._starting - 1)
+        self._unheard = 0 if module.heard else self._unheard + 1
