@@ -19,6 +19,8 @@ _SAME = 1e-3
 """Largest difference, in position (m) and in quaternion, at which neighbouring waypoints count as one."""
 _ANGULAR_RATE, _ANGULAR_ACCELERATION = 0.5, 0.5
 """rad/s and rad/s^2. Turns on the way are gentle, so that the tag stays readable."""
+_LEAST_SHARE = 1e-3
+"""Least share of a speed that is permitted along an axis: an axis that does not move needs a limit above zero too."""
 _THRUSTER_SHARE = 0.6
 """Share of each thruster's range that a mission may use; the rest is reserved against the current."""
 
@@ -50,7 +52,7 @@ def plan_mission(job: PlanJob, body: Body | None, wanted: Callable[[], bool] = l
         for section in _sections(job.legs):
             points, places = _waypoints(p_wb, q_wb, section)
             if len(points) > 1:
-                path = plan(points, None, _limits(job, section[0].speed_m_s), body, wanted=wanted)
+                path = plan(points, None, _limits(job, _velocity(points, section[0].speed_m_s)), body, wanted=wanted)
                 parts.append((at_s, path))
                 arrivals += [at_s + float(path.breaks[place]) for place in places]
                 at_s += path.duration_s
@@ -100,10 +102,17 @@ def _end(points: Sequence[Waypoint]) -> tuple[np.ndarray, np.ndarray]:
     return last.p_wb, last.q_wb
 
 
-def _limits(job: PlanJob, speed_m_s: float) -> Limits:
-    """The limits of a job, with the speed divided among the axes so that it holds in every direction."""
+def _velocity(points: Sequence[Waypoint], speed_m_s: float) -> np.ndarray:
+    """(3,) velocity limit along each axis, m/s, that keeps the speed: on a straight line in its direction, else in every direction."""
+    way = np.abs(points[-1].p_wb - points[0].p_wb)
+    if len(points) > 2 or not way.any():
+        return np.full(3, speed_m_s / np.sqrt(3.0))
+    return np.asarray(speed_m_s * np.maximum(way / np.linalg.norm(way), _LEAST_SHARE))
+
+
+def _limits(job: PlanJob, velocity: np.ndarray) -> Limits:
     return Limits(
-        velocity=np.full(3, speed_m_s / np.sqrt(3.0)),
+        velocity=velocity,
         acceleration=np.full(3, job.acceleration),
         corridor_m=job.corridor_m,
         angular_rate=_ANGULAR_RATE,

@@ -10,7 +10,7 @@ import io
 import itertools
 import math
 from contextlib import redirect_stdout
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -176,6 +176,10 @@ class _Table:
             np.array([p.bound for p in limits]),
         )
 
+    def in_unit(self, unit_m: float) -> _Table:
+        """The same planes with lengths in `unit_m`, m."""
+        return replace(self, centre=self.centre / unit_m, bound=self.bound / unit_m)
+
     def excess(self, coefficients: np.ndarray, durations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(m,) largest |normal . derivative - centre| over bound on each piece, and (m,) the share of the piece at which it is."""
         grid = _towards_ends(np.arange(_CHECK_POINTS + 1) / _CHECK_POINTS)
@@ -241,15 +245,17 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
     if knots.fixed.all():
         _, name, place = worst(limits, system.coefficients(knots.value, start), system.durations)
         raise InfeasibleError(f"no trajectory {in_time} that stops at every waypoint keeps the {name}", place)
-    table = _Table.of(limits)
-    problem = _Problem(system, knots, start)
+    unit_m = float(np.ptp(knots.value, axis=0).max()) or 1.0  # in which OSQP's tolerances suit paths of any length
+    table = _Table.of(limits).in_unit(unit_m)
+    knots = Knots(knots.value / unit_m, knots.fixed, knots.derivative / unit_m)
+    problem = _Problem(system, knots, start / unit_m)
     index = np.repeat(np.arange(len(limits)), _FIRST_POINTS)
     where = np.tile(_towards_ends(np.arange(_FIRST_POINTS) / _FIRST_POINTS), len(limits))
     for _ in range(_ROUNDS):
         try:
             unknown, conflict = problem.solve(table, index, where)
         except (osqp.OSQPException, _GaveUpError) as error:
-            _, name, place = worst(limits, system.coefficients(knots.value, start), system.durations)
+            _, name, place = worst(limits, system.coefficients(unit_m * knots.value, start), system.durations)
             why = "" if isinstance(error, _GaveUpError) else "error "
             raise InfeasibleError(f"no trajectory was found that keeps the {name}", place, f": OSQP gave up with {why}{error}") from None
         if conflict >= 0:
@@ -259,7 +265,7 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
         excess, crest = table.excess(system.coefficients(knots.value, unknown), system.durations)
         broken = np.flatnonzero(excess > 1.0)
         if not len(broken):
-            return unknown
+            return unit_m * unknown
         index = np.concatenate([index, broken])
         where = np.concatenate([where, crest[broken]])
     k = int(np.argmax(excess))

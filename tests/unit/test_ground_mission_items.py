@@ -2,11 +2,14 @@
 
 import math
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.app.mission_plan import plan_mission
 from firmware_py.ground.config import GroundConfig
+from firmware_py.ground.mission_flight import PlanJob
+from firmware_py.ground.mission_legs import Leg
 from tests.unit.ground_missions import PLACES, begin, fly, item, upload
 from tests.unit.ground_requests import NAN
 from tests.unit.ground_world import Client, World
@@ -105,6 +108,16 @@ def test_mission_that_begins_with_a_delay_waits_where_the_robot_is_and_then_goes
     assert plan.arrivals_s[0] == 0.0 and plan.arrivals_s[1] > 25.5
     assert plan.trajectory.sample(24.9).p_wb == pytest.approx(job.p_wb)
     assert plan.trajectory.sample(plan.arrivals_s[1]).p_wb == pytest.approx(job.legs[1].p_wb, abs=1e-6)
+
+
+@pytest.mark.parametrize("by", [(20.0, 0.0, 0.0), (0.0, -20.0, 10.0), (10.0, 10.0, 10.0)], ids=["one axis", "two axes", "all axes"])
+def test_leg_from_a_stop_to_a_stop_reaches_the_speed_that_was_asked_for_and_no_more(by: tuple[float, float, float]) -> None:
+    """Regression: the speed was divided among all axes, also those along which nothing moves."""
+    job = PlanJob(1, 0, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), (Leg(0, np.array(by), None, 0.0, 0.3),), 10.0, 1.0)
+    plan = plan_mission(job, None)
+    assert plan.trajectory is not None
+    speeds = [np.linalg.norm(plan.trajectory.sample(t).v_w) for t in np.linspace(0.0, plan.arrivals_s[0], 500)]
+    assert 0.29 < max(speeds) <= 0.3 * (1.0 + 1e-6)
 
 
 @pytest.mark.parametrize(("asked", "flown"), [(-1.0, 0.3), (-2.0, 0.15)])

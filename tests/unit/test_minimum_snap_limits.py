@@ -148,6 +148,15 @@ def test_time_is_stretched_no_more_than_the_limit_asks() -> None:
         plan(waypoints, shorter, limits, stretch=False)
 
 
+@pytest.mark.parametrize("length_m", [0.1, 1.0, 5.0, 100.0])
+def test_straight_path_takes_the_same_share_of_its_speed_whatever_its_length(length_m: float) -> None:
+    """Regression: OSQP took paths of five metres and more for infeasible where shorter ones were flown, and they took 1.4 times as long."""
+    limits = Limits(velocity=np.full(3, 0.15), acceleration=np.full(3, 10.0))
+    found = plan([Waypoint(np.zeros(3)), Waypoint(np.array([length_m, 0.0, 0.0]))], None, limits)
+    assert length_m / found.duration_s == pytest.approx(0.65 * 0.15, rel=0.02)
+    assert np.all(extremes(found)[0] <= 0.15 * (1.0 + 1e-6))
+
+
 def test_free_durations_are_found_though_a_given_velocity_bounds_them_from_above() -> None:
     """At 1.5 m/s through the middle of a narrow corridor, a path that takes the 20 s with which the search begins would overshoot."""
     at = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
