@@ -122,6 +122,8 @@ class FaultDetector:
         self._silent: list[int] = []
         """Modules, by place in the body, whose thrusters are left out because of their silence."""
         self._watches = [CommandWatch(period_ns) for _ in body.modules]
+        self._stopped = np.zeros(n, dtype=bool)
+        """Thrusters that may stand still because their module hears, or heard, no commands."""
         self._well: dict[int, int] = {}
         """Feedbacks in a row without a fault of each thruster that is left out because its ESC had failed."""
         self._believed: deque[np.ndarray] = deque(maxlen=max(1, BELIEVED_NS // period_ns))
@@ -193,7 +195,8 @@ class FaultDetector:
             self._watches[i].step(module)
             self._late_ticks[i] = self._late_ticks[i] if module.mcu_state is None else module.late_ticks
         self._believed.append(force_n)
-        free = free and not any(watch.stopped for watch in self._watches)
+        self._stopped = np.array([watch.stopped for watch in self._watches])[self._t.module]
+        free = free and not (self._stopped & self.now.alive).any()
         found = self._motion.step(measured, estimate, mean_n * self._reported_share, self.now.alive, armed, free)
         if found is not None:
             self._lose(found, "does not push as it says")
@@ -255,9 +258,7 @@ class FaultDetector:
         full, limits = (self._full_n, self._t.rpm_at_full), (*self._limits, self._needed)
         state = (self._counts, self._feedback_means, self._reported_share)
         found = count_feedback(feedback, force_n, self.now.alive, *full, *limits, *state)
-        stopped = [i for i, watch in enumerate(self._watches) if watch.stopped]
-        if stopped:
-            self._counts[np.isin(self._t.module, stopped)] = 0
+        self._counts[self._stopped] = 0
         if found:
             for i, kind in np.argwhere(self._counts >= self._needed).tolist():
                 if self.now.alive[i]:

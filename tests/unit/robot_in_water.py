@@ -9,7 +9,7 @@ from firmware_py.core.preload import preload
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import difference, from_euler, to_matrix
 from firmware_py.core.thruster import ThrusterLag
-from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
+from firmware_py.core.types import MCU_TIMED_OUT, EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
@@ -34,6 +34,8 @@ class Water:
         self.speed_factor, self.stray_rpm = np.ones(n), np.zeros(n)
         self.status = np.zeros(n, dtype=int)
         self.heard = 1.0
+        self.deaf: int | None = None
+        """Module that says that it hears no commands."""
         self.accel_bias = np.full(3, 0.05)
         self.free = True
         self.pushed = np.zeros(6)
@@ -76,7 +78,8 @@ class Water:
             measured = Measured(None, None, None, [])
         fleet = [ModuleInputs() for _ in range(max(b.modules) + 1)]
         for number, module in enumerate(b.modules):
-            fleet[module] = ModuleInputs(esc=self._feedback(8 * number))
+            state = MCU_TIMED_OUT if module == self.deaf else None
+            fleet[module] = ModuleInputs(heard=True, mcu_state=state, esc=self._feedback(8 * number))
         self.detector.step(fleet, measured, estimate, self.believed.force_n, believed, armed, self.free)
         return self.detector.words
 

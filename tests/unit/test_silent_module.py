@@ -3,10 +3,12 @@
 import numpy as np
 
 from firmware_py.core.faults import FaultDetector
+from firmware_py.core.preload import preload
 from firmware_py.core.types import CHANNELS, MCU_TIMED_OUT, EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
+from tests.unit.robot_in_water import Water
 
 TICK_NS, DT = 10_000_000, 0.01
 ZERO = np.zeros(3)
@@ -112,6 +114,18 @@ def test_thrusters_of_a_module_that_hears_no_commands_are_left_out_until_it_does
     assert said == ["module 1 does not hear its commands: its thrusters stop", "thrusters of silent module 1 are left out"]
     assert rig.used == {0}
     assert rig.run(1.0, 0, 1) == ["thrusters of every module are used again"] and rig.used == {0, 1}
+
+
+def test_liar_in_another_module_is_found_while_a_module_that_hears_no_commands_is_left_out() -> None:
+    body = DetectorRig().body
+    water = Water(body=body)
+    water.run(3.0, preload(body.thrusters, np.ones(16, dtype=bool), 0.6))
+    water.deaf, water.gain[8:], water.speed_factor[8:] = 1, 0.0, 0.0
+    rest = preload(body.thrusters, body.thrusters.module == 0, 0.6)
+    water.run(4.0, rest)
+    water.gain[2] = 0.0
+    found = water.run(2.0, rest)
+    assert [words for _, words in found] == ["thruster 3 of module 0 does not push as it says: left out"]
 
 
 class PushingRig(DetectorRig):
