@@ -49,7 +49,7 @@ def _answers(q: Question) -> str:
 
 
 def _fit(q: Question) -> str:
-    return f"module {', '.join(str(m) for m in q.health.unfit)} starts, or has a fault" if q.health.unfit else ""
+    return f"module {', '.join(str(m) for m in q.health.unfit)} starts, hears no commands, or has a fault" if q.health.unfit else ""
 
 
 def _needs(q: Question) -> list[str]:

@@ -47,7 +47,7 @@ class Health(NamedTuple):
     silent: tuple[int, ...]
     """Fleet indices of modules without a recent answer."""
     silent_s: float
-    """Longest present silence of any module."""
+    """Longest present silence of any module; one that reports that it hears no commands counts as silent."""
     bus_silent_s: float
     """Shortest present silence of any module, or the time without a tick before this one if that is longer: a process that was stopped has
     heard nobody meanwhile, whatever it finds when it goes on."""
@@ -81,7 +81,7 @@ class Health(NamedTuple):
     cabin_age_s: float = 0.0
     """The same for cabin readings, whose frame carries the leak sensor too."""
     unfit: tuple[int, ...] = ()
-    """Fleet indices of modules that report starting up, or a fault."""
+    """Fleet indices of modules that report starting up, hearing no commands, or a fault."""
     open_joints: tuple[frozenset[int], ...] = ()
     """Modules of each joint that is open although it should hold."""
     push_m_s: float = 0.0

@@ -13,7 +13,18 @@ from firmware_py.core.fence import outside
 from firmware_py.core.health import Health
 from firmware_py.core.rotations import rotate
 from firmware_py.core.thruster_names import Place, places_of
-from firmware_py.core.types import MCU_ESTOP, MCU_UNFIT, NEVER_NS, Action, EscFeedback, Estimate, Inputs, ModuleInputs, Request
+from firmware_py.core.types import (
+    MCU_ESTOP,
+    MCU_TIMED_OUT,
+    MCU_UNFIT,
+    NEVER_NS,
+    Action,
+    EscFeedback,
+    Estimate,
+    Inputs,
+    ModuleInputs,
+    Request,
+)  # fmt: skip
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import AXES
 
@@ -69,12 +80,12 @@ class HealthMonitor:
         self._unknown_esc_ns: dict[Place, int] = {}
         """When an ESC was last heard that belongs to no thruster, by its place."""
         never = dict.fromkeys(body.modules, NEVER_NS)
-        self._heard_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns = (never.copy() for _ in range(5))
-        self._unfit, self._leak, self._wet = (dict.fromkeys(body.modules, False) for _ in range(3))
+        self._heard_ns, self._hears_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns = (never.copy() for _ in range(6))
+        self._deaf, self._unfit, self._leak, self._wet = (dict.fromkeys(body.modules, False) for _ in range(4))
         self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa = (dict[int, float]() for _ in range(4))
         self._per_module: tuple[dict[int, Any], ...] = (
-            self._heard_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns, self._unfit, self._leak, self._wet,
-            self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa,
+            self._heard_ns, self._hears_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns, self._deaf, self._unfit,
+            self._leak, self._wet, self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa,
         )  # fmt: skip
         """By fleet index: the last report of each module of the body, and its time."""
         self._stopped_ns: dict[int, int] = {}
@@ -119,7 +130,8 @@ class HealthMonitor:
         now, latest = inputs.time_ns, self._latest
         if latest.time_ns == NEVER_NS:  # first tick: silence counts from here
             latest.time_ns = latest.depth_ns = latest.imu_ns = latest.ready_ns = now
-            self._heard_ns.update(dict.fromkeys(self._heard_ns, now))
+            for heard_ns in (self._heard_ns, self._hears_ns):
+                heard_ns.update(dict.fromkeys(heard_ns, now))
         self._listen(inputs.modules, now)
         self._hear_stops(inputs.modules, now)
         if self.imu_heard:
@@ -159,7 +171,7 @@ class HealthMonitor:
             cabin_change_pa=max(self._cabin_change_pa.values(), default=math.nan),
             stopped=tuple([m for m, at in self._stopped_ns.items() if m in self._heard_ns or now - at <= self._answer_ns]),
             silent=tuple([m for m, at in self._answered_ns.items() if now - at > self._answer_ns]),
-            silent_s=(now - min(self._heard_ns.values())) * 1e-9,
+            silent_s=(now - min(self._hears_ns.values())) * 1e-9,
             bus_silent_s=max(now - max(self._heard_ns.values()), stopped_ns) * 1e-9,
             esc_missing=tuple([self._places[i] for i in _older(self._esc_ns, now - self._esc_fresh_ns)]),
             frame_errors_per_s=latest.error_rate,
@@ -193,11 +205,13 @@ class HealthMonitor:
                 self._heard_ns[index] = self._answered_ns[index] = now
             elif module.heard:
                 self._heard_ns[index] = now
+            if module.mcu_state is not None:
+                self._deaf[index], self._unfit[index] = module.mcu_state == MCU_TIMED_OUT, module.mcu_state in MCU_UNFIT
+            if self._heard_ns[index] == now and not self._deaf[index]:
+                self._hears_ns[index] = now
             for tag in module.tags:
                 if tag.capture_ns > self._pictures_ns[1]:
                     self._pictures_ns = self._pictures_ns[1], tag.capture_ns
-            if module.mcu_state is not None:
-                self._unfit[index] = module.mcu_state in MCU_UNFIT
             if module.leak is not None:
                 self._wet_ns[index] = now if module.leak and self._wet[index] else self._wet_ns[index]
                 self._leak[index] = module.leak or now - self._wet_ns[index] < DRY_NS

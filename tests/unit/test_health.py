@@ -92,7 +92,7 @@ def test_e_stop_that_holds_a_module_of_another_body_is_heard_until_that_falls_si
     assert set(whole._stopped_ns) == {0, 2, 3}
 
 
-def test_module_that_starts_or_has_a_fault_is_unfit_until_it_says_otherwise() -> None:
+def test_module_that_starts_or_is_deaf_or_has_a_fault_is_unfit_until_it_says_otherwise() -> None:
     bench = MonitorBench()
     assert bench.step().unfit == ()
     assert bench.step(here(mcu_state=1), here(mcu_state=5)).unfit == (3,)
@@ -100,8 +100,22 @@ def test_module_that_starts_or_has_a_fault_is_unfit_until_it_says_otherwise() ->
     whole = MonitorBench()
     whole.monitor.take_over([bench.monitor])
     assert whole.step().unfit == (1, 3)
-    for state in (1, 2, 3, 4):
+    assert bench.step(here(mcu_state=3), here(mcu_state=1)).unfit == (1,)
+    for state in (1, 2, 4):
         assert bench.step(here(mcu_state=state), here(mcu_state=state)).unfit == ()
+
+
+def test_module_that_says_that_it_hears_no_commands_counts_as_silent() -> None:
+    bench = MonitorBench()
+    bench.step(here(mcu_state=2), here(mcu_state=2))
+    deaf_s = [bench.step(here(mcu_state=3), here(mcu_state=2)).silent_s, bench.step(here(), here(mcu_state=2)).silent_s]
+    assert 0.0 < deaf_s[0] < deaf_s[1], "frames without a status are as the status before"
+    assert bench.monitor.now.bus_silent_s == 0.0 and bench.monitor.now.silent == (), "it answers"
+    whole = MonitorBench()
+    whole.time_ns = bench.time_ns
+    whole.monitor.take_over([bench.monitor])
+    assert whole.step(here(), here()).silent_s > deaf_s[1]
+    assert bench.step(here(mcu_state=2), here(mcu_state=2)).silent_s == 0.0
 
 
 def test_module_that_only_talks_has_not_answered() -> None:
