@@ -133,8 +133,8 @@ class Body:
         supply_power_w: (m,) power that each module's supply can give to its thrusters and magnets.
         hull_m: (m, 3) edges of each module's hull, a box, along the axes of the body, m.
         reach_m: largest distance of any point of its hulls from the centre of mass, m.
-        deceleration: (2,) with which all its thrusters stop its motion and its turn along the axis where that takes longest, passive axes
-            left out, m/s^2 and rad/s^2.
+        deceleration: (2,) with which all its thrusters stop its motion and its turn along the axis where that takes longest, m/s^2 and
+            rad/s^2; passive axes, and those without thrust, left out.
         depth_rating_m: largest depth that all its vehicles are made for, m.
         cells: (m, 3) lattice cells; name: for display.
         faces: per module the kinds of its six faces, a letter each, as in the vehicle file (P probe, D drogue).

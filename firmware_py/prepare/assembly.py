@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_py.core import rotations
-from firmware_py.core.body import ARM_SIGMA_M, BUOYANCY_SIGMA_N, TRIM_SIGMA_M, Body, ThrusterSet, can_make
+from firmware_py.core.body import ARM_SIGMA_M, BUOYANCY_SIGMA_N, TRIM_SIGMA_M, Body, ThrusterSet, axes_without_thrust, can_make
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import AXES, MOST_THRUSTERS, Vehicle, too_many_thrusters
@@ -151,7 +151,7 @@ def _body(placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: fl
 
 def _deceleration(thrusters: ThrusterSet, mass: np.ndarray, passive: Sequence[int]) -> np.ndarray:
     along = thrusters.full_wrench / np.diag(mass)
-    along[list(passive)] = np.inf
+    along[[*passive, *axes_without_thrust(thrusters.matrix, passive)]] = np.inf
     return np.asarray(along.reshape(2, 3).min(axis=1))
 
 

@@ -195,6 +195,17 @@ def test_deceleration_is_that_of_the_weakest_axis_which_is_steered() -> None:
     rov = assemble_vehicle(load_vehicle("bluerov2"))
     along = rov.thrusters.full_wrench / np.diag(rov.mass)
     assert rov.passive == (4,) and rov.deceleration[1] == pytest.approx(min(along[3], along[5]))
+    undeclared = assemble_vehicle(dataclasses.replace(load_vehicle("bluerov2"), passive_dof=()))
+    assert undeclared.deceleration.tolist() == rov.deceleration.tolist()
+
+
+def test_body_without_any_thrust_along_an_axis_brakes_along_the_others() -> None:
+    """It may fly by force. Regression: its time to brake was no number, and another body that it wanted to swim into was not in its way."""
+    half = dataclasses.replace(MODCUBE, thruster=MODCUBE.thruster[:4])
+    bodies = [assemble([(0, 0, 0)], [0], [half], [number]) for number in (0, 5)]
+    assert all(bodies[0].deceleration > 0.0) and np.isfinite(bodies[0].deceleration[0])
+    times_s = times_to_brake(bodies, {0: at(ZERO), 5: at([1.0, 0.0, 0.0])}, {0: np.array([0.4, 0.0, 0.0]), 5: ZERO}, 6.0)
+    assert 0.0 < times_s[0] < (1.0 - TOUCH_M) / 0.4
 
 
 # ------------------------------------------------------------ whole ticks
