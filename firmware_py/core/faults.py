@@ -1,9 +1,9 @@
-"""Detection of dead and lying thrusters: from ESC reports, from missing motion, and from modules that fall silent. Runs between estimator
-and supervisor.
+"""Detection of dead and lying thrusters: from ESC reports, from missing motion, and from modules that fall silent or hear no commands. Runs
+between estimator and supervisor.
 
 A thruster that was found faulty stays excluded until the body is disarmed, unless leaving it out shows that something else pushes
-(`thruster_trial`), or it was its ESC that failed and is well again, as after a sag of the supply. Those of a silent module stay excluded
-until it is heard again.
+(`thruster_trial`), or it was its ESC that failed and is well again, as after a sag of the supply. Those of a module that is silent, or hears
+no commands, stay excluded until it has been well for as long (`SILENT_NS`).
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ CLEAR = 4.0
 """A repeated standstill counts twice where the believed force is at least this many times the least judged force: the propeller is not
 just about to start."""
 SILENT_NS = 500_000_000
-"""Silence after which a module's thrusters are excluded, if the others can make every wrench without them; the fail-safe `module_silent`
-acts then too. A module that hears nothing either has stopped its thrusters after 100 ms (DESIGN's bus); one that still hears stops them
-because of the exclusion."""
+"""Silence, or deafness, after which a module's thrusters are excluded, if the others can make every wrench without them; the fail-safe
+`module_silent` acts then too. A silent module that hears nothing either has stopped its thrusters after 100 ms (DESIGN's bus); one that
+still hears stops them because of the exclusion."""
 WELL_AGAIN = 10
 """Feedbacks in a row without a fault, one second's, after which a thruster whose ESC had failed is used again."""
 BELIEVED_NS = 500_000_000
@@ -118,9 +118,9 @@ class FaultDetector:
         """Thrusters without a fault of their own."""
         self._silent_after = max(1, SILENT_NS // period_ns)
         self._silence = [0] * len(body.modules)
-        """Ticks that each module has been silent; counts down again while an excluded module is heard."""
+        """Ticks that each module has been silent or deaf; counts down again while an excluded module is heard."""
         self._silent: list[int] = []
-        """Modules, by place in the body, whose thrusters are left out because of their silence."""
+        """Modules, by place in the body, whose thrusters are left out because they are silent or hear no commands."""
         self._watches = [CommandWatch(period_ns) for _ in body.modules]
         self._stopped = np.zeros(n, dtype=bool)
         """Thrusters that may stand still because their module hears, or heard, no commands."""
