@@ -2,8 +2,8 @@
 between estimator and supervisor.
 
 A thruster that was found faulty stays excluded until the body is disarmed, unless leaving it out shows that something else pushes
-(`thruster_trial`), or it was its ESC that failed and is well again, as after a sag of the supply. Those of a module that is silent, or hears
-no commands, stay excluded until it has been well for as long (`SILENT_NS`).
+(`thruster_trial`), or it was its ESC that failed and is well again, as after a sag of the supply. Those of a module that is silent, or
+hears no commands, stay excluded until it has been well for as long (`SILENT_NS`).
 """
 
 from __future__ import annotations
