@@ -39,13 +39,15 @@ FREE = PLACED - {Mode.DOCK}
 TRUSTING = frozenset({Mode.ALT_HOLD, Mode.STABILIZE})
 """Modes that hold depth or attitude by the estimate for a pilot: if it contradicts the tags, he is told, and keeps control."""
 PILOTED = frozenset(row.mode for row in MODE_TABLE if row.by_pilot)
+UNSTOPPED = PILOTED | {Mode.SURFACE}
+"""Modes in which nothing stops a body short of disarming it: a pilot's, and the way up."""
 
 PERMITTED = {
     Level.NONE: ANY,
     Level.WARN: ANY,
-    Level.HOLD: PILOTED | {Mode.POSHOLD, Mode.SURFACE, Mode.MOTOR_DETECT},
-    Level.DEPTH: PILOTED | {Mode.SURFACE},
-    Level.SURFACE: PILOTED | {Mode.SURFACE},
+    Level.HOLD: UNSTOPPED | {Mode.POSHOLD, Mode.MOTOR_DETECT},
+    Level.DEPTH: UNSTOPPED,
+    Level.SURFACE: UNSTOPPED,
     Level.DISARM: frozenset[Mode](),
 }
 """Modes that may be entered while the cause of a fail-safe of that level lasts. Below DISARM a pilot may always take over."""
@@ -93,7 +95,7 @@ TABLE = (
     Row("module_silent", "a module is silent", "silent_s", LASTS),
     Row("ticks_missed", "ticks missed", "missed_ticks_per_s", ": {:.0f} in a second"),
     Row("fence", "outside the fence", "outside_m", " by {:.2f} m", modes=MOVING, forced_modes=frozenset({Mode.ALT_HOLD})),
-    Row("collision", "another body is in the way", "collision_s", ", {:.1f} s to brake", below=True, modes=FREE, warned_modes=PILOTED),
+    Row("collision", "another body is in the way", "collision_s", ", {:.1f} s to brake", below=True, modes=FREE, warned_modes=UNSTOPPED),
     Row("ground_lost", "ground station silent", "ground_age_s", LASTS, modes=ANY - {Mode.AUTO, Mode.SURFACE}),
     Row("pilot_lost", "pilot silent", "pilot_age_s", LASTS, modes=PILOTED),
     Row("thruster_lost", "a thruster is out", "thruster_lost"),

@@ -295,3 +295,15 @@ def test_body_at_rest_close_by_does_not_set_out_into_the_other(gap_m: float) -> 
     before = len(tank.past)
     tank.run(5.0, Request(Action.HOLD, 0, Setpoint(np.array([2.4, 0.0, 0.8]), LEVEL, ZERO, ZERO, ZERO, ZERO)))
     assert distances(tank)[before:].min() > EDGE_M + gap_m - 0.04
+
+
+@pytest.mark.slow
+def test_body_that_surfaces_below_another_says_so() -> None:
+    """It pushed against the other from below, and nobody was told."""
+    tank = FaultyTank([(0, 0, 0), (1, 0, 0)], Parameters(), apart=True)
+    for state, down_m in zip(tank.states, (1.6, 0.8), strict=True):
+        state[:7] = [0.0, 0.0, down_m, *from_euler(0.0, 0.0, 0.0)]
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 1))
+    tank.run(7.0, Request(Action.SET_MODE, 0, Mode.SURFACE))
+    assert tank.when("fail-safe on: another body is in the way") and tank.outputs[-1].records[0].mode == Mode.SURFACE

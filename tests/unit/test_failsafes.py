@@ -94,7 +94,7 @@ COUNTS = {
     "pushed": POSE_MODES - {Mode.DOCK},
     "tag_late": POSE_MODES - {Mode.POSHOLD},
     "fence": POSE_MODES - {Mode.POSHOLD},
-    "collision": {Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.ALT_HOLD, Mode.STABILIZE, Mode.MANUAL},
+    "collision": {Mode.POSHOLD, Mode.AUTO, Mode.GUIDED, Mode.ALT_HOLD, Mode.STABILIZE, Mode.MANUAL, Mode.SURFACE},
     "ground_lost": set(Mode) - {Mode.AUTO, Mode.SURFACE},
     "pilot_lost": {Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD},
 }
@@ -119,7 +119,7 @@ def test_pilot_is_only_told_of_what_he_may_judge_himself(name: str, mode: Mode) 
     """That the estimate contradicts the tags, in modes that use it; that another body is in his way."""
     only_warns = mode in {
         "estimator": (Mode.ALT_HOLD, Mode.STABILIZE), "rejected": (Mode.ALT_HOLD, Mode.STABILIZE),
-        "collision": (Mode.ALT_HOLD, Mode.STABILIZE, Mode.MANUAL),
+        "collision": (Mode.ALT_HOLD, Mode.STABILIZE, Mode.MANUAL, Mode.SURFACE),
     }.get(name, ())  # fmt: skip
     for action in Level:
         wanted = replace(quick(name), **{f"{name}_action": int(action)})
