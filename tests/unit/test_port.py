@@ -182,6 +182,19 @@ class TestSlcan(PortSuite):
         other.close()
         again.unplug()
 
+    def test_adapter_that_got_the_name_of_another_between_two_reads_is_taken_up(self, pair, cable, tmp_path):
+        """The other one, still open, was read for ever, because a device of its name was there."""
+        one, other = pair
+        for link in cable.links:
+            link.unlink()
+        again = Cable(tmp_path)
+        assert poll(lambda: [one.receive(), other.receive()] and one.faults["reopened"] == other.faults["reopened"] == 1)
+        one.send(FRAMES[1])
+        assert receive(other, 1) == [FRAMES[1]]
+        one.close()
+        other.close()
+        again.unplug()
+
     def test_adapter_that_takes_no_more_is_counted_and_tears_no_frame(self, pair, cable):
         one, other = pair
         cable.stop()

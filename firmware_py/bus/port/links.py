@@ -337,7 +337,11 @@ class SlcanLink(Link):
         return os.path.exists(self.address)
 
     def is_same(self) -> bool:
-        return os.path.exists(self.address)
+        """Whether the name still leads to the device that was opened: another one under it, plugged in meanwhile, would not be heard."""
+        try:
+            return self._lock is not None and os.path.samestat(os.fstat(self._lock), os.stat(self.address))
+        except OSError:
+            return False
 
 
 def error_number(error: BaseException) -> int | None:
