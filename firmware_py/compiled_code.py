@@ -12,15 +12,15 @@ from pathlib import Path
 
 CACHE_FOLDER = "NUMBA_CACHE_DIR"
 """Numba's environment variable for its cache folder; inherited by child processes."""
-_SUFFIXES = (".nbi", ".nbc")
-"""Of numba's files: an index, and compiled code."""
+_INDEX, _CODE = ".nbi", ".nbc"
+"""Endings of numba's files."""
 _PICKLE_BEGIN, _PICKLE_END = b"\x80", b"."
 """First and last byte of a pickle: its opcodes PROTO and STOP."""
 
 
-def caches(package: Path) -> list[Path]:
-    """numba's index files below `package`. Skips folders that vanish meanwhile or cannot be read (Path.rglob would raise)."""
-    return [Path(folder, name) for folder, _, names in os.walk(package) for name in names if name.endswith(".nbi")]
+def caches(package: Path, endings: tuple[str, ...] = (_INDEX,)) -> list[Path]:
+    """numba's files of these `endings` below `package`. Skips folders that vanish meanwhile or cannot be read (Path.rglob would raise)."""
+    return [Path(folder, name) for folder, _, names in os.walk(package) for name in names if name.endswith(endings)]
 
 
 def cached_sources(root: Path, packages: Iterable[str]) -> set[str]:
@@ -76,9 +76,7 @@ def forget_torn_code(*folders: Path) -> None:
 
     Numba raises EOFError or UnpicklingError for such a file, at every start. Each of its files begins and ends as a pickle does.
     """
-    for path in (Path(folder, name) for top in folders for folder, _, names in os.walk(top) for name in names):
-        if path.suffix not in _SUFFIXES:
-            continue
+    for path in (path for folder in folders for path in caches(folder, (_INDEX, _CODE))):
         try:
             with path.open("rb") as file:
                 begin = file.read(1)

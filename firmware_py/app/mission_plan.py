@@ -111,6 +111,7 @@ def _velocity(points: Sequence[Waypoint], speed_m_s: float) -> np.ndarray:
 
 
 def _limits(job: PlanJob, velocity: np.ndarray) -> Limits:
+    """The limits of a job, with that of `velocity` (3,) along each axis, m/s."""
     return Limits(
         velocity=velocity,
         acceleration=np.full(3, job.acceleration),

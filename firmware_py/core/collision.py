@@ -68,7 +68,8 @@ def times_to_brake(
     wanted = np.array([wanted_w[number] for number in numbers])
     nu = np.array([estimates[number].nu for number in numbers]).reshape(-1, 2, 3)
     deceleration = np.array([body.deceleration for body in placed])
-    own, asked = np.linalg.norm(nu, axis=2), np.pad(np.linalg.norm(wanted, axis=1, keepdims=True), ((0, 0), (0, 1)))
+    own, asked = np.linalg.norm(nu, axis=2), np.zeros((len(placed), 2))
+    asked[:, 0] = np.linalg.norm(wanted, axis=1)
     left = np.fmin(
         _soonest(r_w, v_w, v_w, cylinder, of_body, ignored) - braking_s(own, deceleration, bandwidth),
         _soonest(r_w, wanted[of_body], v_w, cylinder, of_body, ignored) - braking_s(asked, deceleration, bandwidth),

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from firmware_py.core.types import MCU_TIMED_OUT, ModuleInputs
+from firmware_py.core.types import COMMAND_TIMEOUT_NS, MCU_TIMED_OUT, ModuleInputs
 
-STOPPED_NS = 100_000_000
-"""Silence after which a module may have stopped its thrusters: it may hear no commands either (DESIGN's bus)."""
 START_NS = 300_000_000
 """How long propellers that were stopped may stand still: four lags. A bus that was interrupted may first deliver in a burst the commands
 and the answers that it kept, all of propellers that stood still."""
@@ -15,9 +13,9 @@ class CommandWatch:
     """Watches one module."""
 
     def __init__(self, period_ns: int) -> None:
-        self._stopped_after, self._start_ticks = max(1, STOPPED_NS // period_ns), max(1, START_NS // period_ns)
+        self._stopped_after, self._start_ticks = max(1, COMMAND_TIMEOUT_NS // period_ns), max(1, START_NS // period_ns)
         self._unheard = 0
-        """Ticks in a row in which the module was not heard."""
+        """Ticks in a row in which the module was not heard. After COMMAND_TIMEOUT_NS it may have stopped: it may hear nothing either."""
         self._deaf = self._starting = 0
         """Ticks for which it goes on counting as deaf, and as stopped."""
 

@@ -209,6 +209,8 @@ class FaultDetector:
     def _believed_at_answers(self) -> np.ndarray:
         """Returns the believed forces (n,) at the time of each module's latest answer, N; the present ones where that is not kept."""
         force_n = self._believed[-1]
+        if not any(self._late_ticks):
+            return force_n
         for i, late_ticks in enumerate(self._late_ticks):
             if 0 < late_ticks < len(self._believed):
                 force_n = np.where(self._t.module == i, self._believed[-1 - late_ticks], force_n)

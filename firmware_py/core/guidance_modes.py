@@ -20,11 +20,11 @@ from firmware_py.core.rotations import difference, heading, rotate, rotate_back
 from firmware_py.core.setpoint import REST, Glider, Trajectory, Wish, ahead_of, at_estimate, on_leash, rest_at
 from firmware_py.core.supervisor import TAKES_OVER, Decision
 from firmware_py.core.transitions import Effect
-from firmware_py.core.types import Estimate, Mode, Setpoint, Sticks
+from firmware_py.core.types import COMMAND_TIMEOUT_NS, Estimate, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 
 ZERO, DOWN = np.zeros(3), np.array([0.0, 0.0, 1.0])
-STILL_S = 0.1
+STILL_S = COMMAND_TIMEOUT_NS / 1e9
 """Longest gap between two ticks. After a longer one the microcontrollers have stopped all thrust (DESIGN), and the set-point restarts from
 the body."""
 NEAR_M, NEAR_RAD = 0.2, 0.35
@@ -111,6 +111,7 @@ class Guidance:
         self._no_place_s, self._no_depth_s = f.tag_lost_limit, f.depth_unknown_limit
         self._most_push_m_s = f.pushed_limit if f.pushed_action > Level.WARN else math.inf
         self._least_s = f.collision_limit if f.collision_action >= Level.HOLD else 0.0
+        # least time to a place, so that the fail-safe `collision` permits one just before another body
         self._arrival_s = f.collision_limit + float(braking_s(np.array([p.speed_m_s, 0.0]), self._body.deceleration, p.bandwidth))
         self._full_stick = p.stick_share * self._body.thrusters.full_wrench
         self._lift_n = p.surface_force_n * len(self._body.modules)
@@ -304,7 +305,7 @@ class Guidance:
             return wish
         self.wanted_w = wish.v_w
         if wish.p_wb is not None:
-            way = np.nan_to_num(wish.p_wb - self._glider.at.p_wb)  # slowed near its end: a place before another body is permitted
+            way = np.nan_to_num(wish.p_wb - self._glider.at.p_wb)
             self.wanted_w = wish.v_w + way / max(self._arrival_s, float(np.linalg.norm(way)) / self._p.speed_m_s)
         return REST if health.collision_s < self._least_s else wish
 

@@ -13,10 +13,11 @@ from numba import njit
 
 from firmware_py.core.propagation import ERRORS, PLANT, STATE, carry, inertial_acceleration, inject, predict, squared_speeds
 from firmware_py.core.rotations import M, V, difference, rotate_back, skew, to_matrix
+from firmware_py.core.types import COMMAND_TIMEOUT_NS
 from firmware_py.description.water import GRAVITY
 
 ANY_NIS = math.inf
-UNTOLD_S = 0.1
+UNTOLD_S = COMMAND_TIMEOUT_NS / 1e9
 """Time within which thrust may fail unnoticed while no inertial sensor tells of the motion: so long a microcontroller that hears nothing
 keeps its thrusters on. A robot that held a tilt without tags, and whose bus was interrupted for 0.3 s, was sure of an attitude that was
 2 deg wrong, and swam metres off by it."""

@@ -150,6 +150,7 @@ def _body(placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: fl
 
 
 def _deceleration(thrusters: ThrusterSet, mass: np.ndarray, passive: Sequence[int]) -> np.ndarray:
+    """`Body.deceleration` (2,) of a body with this mass matrix (6, 6) and these passive axes, 0 to 5."""
     along = thrusters.full_wrench / np.diag(mass)
     along[[*passive, *axes_without_thrust(thrusters.matrix, passive)]] = np.inf
     return np.asarray(along.reshape(2, 3).min(axis=1))
