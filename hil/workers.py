@@ -18,6 +18,7 @@ from threading import Thread
 from typing import Any
 
 from firmware_py.description.schema import DescriptionError
+from firmware_py.runtime.interrupts import signals_blocked
 
 Pool = Callable[[], AbstractContextManager[Executor]]
 """Makes a context that starts the workers and ends them."""
@@ -28,11 +29,8 @@ class Processes(ProcessPoolExecutor):
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Submits one call; starts a process for it if none is idle."""
-        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
+        with signals_blocked([signal.SIGINT]):
             return super().submit(fn, *args, **kwargs)
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def processes(jobs: int) -> Pool:
@@ -51,11 +49,11 @@ def processes(jobs: int) -> Pool:
             try:
                 yield pool
             except BaseException:
-                pool.shutdown(wait=False, cancel_futures=True)
-                for child in active_children():
-                    if child not in others:
-                        child.terminate()
-                        child.join()
+                with signals_blocked([signal.SIGINT]):  # a second Ctrl-C could lose the exit status that the pool's thread waits for
+                    for child in active_children():
+                        if child not in others:
+                            child.terminate()
+                    pool.shutdown(cancel_futures=True)
                 raise
 
     return use

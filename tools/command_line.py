@@ -61,4 +61,5 @@ def run_tool(main: Callable[[], int | None]) -> NoReturn:
     try:
         sys.exit(main())
     except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
         sys.exit(INTERRUPTED)

@@ -174,6 +174,7 @@ def test_no_more_processes_are_started_than_there_is_work_for() -> None:
 
 PROGRAM = """
 import os, signal, tempfile, time
+from firmware_py.runtime.interrupts import interrupted_once
 from hil.workers import processes
 
 
@@ -186,7 +187,7 @@ def fly() -> None:
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)  # what a shell runs in the background ignores it
     try:
-        with processes(2)() as pool:
+        with interrupted_once(), processes(2)() as pool:
             [pool.submit(fly) for _ in range(9)][0].result()
     except KeyboardInterrupt:
         raise SystemExit(130) from None
