@@ -36,6 +36,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "firmware_py.core.supervisor": SUPERVISOR,
     "firmware_py.core.arming": ("tests/unit/test_arming.py",),
     "firmware_py.core.failsafes": ("tests/unit/test_failsafes.py",),
+    "firmware_py.core.collision": ("tests/unit/test_collision.py",),
+    "firmware_py.core.command_watch": ("tests/unit/test_command_watch.py",),
     "firmware_py.core.limiter": ("tests/unit/test_limiter.py",),
 }
 """Tests of each module, which must kill its mutants."""
