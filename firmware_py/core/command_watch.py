@@ -5,8 +5,8 @@ from __future__ import annotations
 from firmware_py.core.types import COMMAND_TIMEOUT_NS, MCU_TIMED_OUT, ModuleInputs
 
 START_NS = 300_000_000
-"""How long propellers that were stopped may stand still: nearly four lags. A bus that was interrupted may first deliver in a burst the commands
-and the answers that it kept, all of propellers that stood still."""
+"""How long propellers that were stopped may stand still: nearly four lags. A bus that was interrupted may first deliver in a burst the
+commands and the answers that it kept, all of propellers that stood still."""
 
 
 class CommandWatch:
