@@ -29,7 +29,7 @@ from argument_types import whole
 
 ROOT = Path(__file__).resolve().parents[1]
 TIMEOUT_S = 60
-"""A mutant that runs longer is killed."""
+"""A mutant that needs more time of the processor is killed."""
 SUPERVISOR = tuple(f"tests/unit/test_supervisor{part}.py" for part in ("", "_failsafes", "_bodies"))
 TARGETS: dict[str, tuple[str, ...]] = {
     "firmware_py.core.transitions": ("tests/unit/test_transitions.py", *SUPERVISOR),
@@ -42,9 +42,9 @@ TARGETS: dict[str, tuple[str, ...]] = {
 }
 """Tests of each module, which must kill its mutants."""
 QUICKLY = (
-    "-x", "-q", "--assert=plain", "--tb=no", "-pno:cacheprovider", "-pno:unraisableexception", "-pno:threadexception",
+    "-x", "-q", "-mnot slow", "--assert=plain", "--tb=no", "-pno:cacheprovider", "-pno:unraisableexception", "-pno:threadexception",
 )  # fmt: skip
-"""pytest's options: only whether a test fails matters."""
+"""pytest's options: only whether a test fails matters; a flight in plain Python would take minutes."""
 HEAVY = (
     "numba", "numpy", "pytest", "scipy.spatial.transform", "firmware_py.core.drag_lookup", "firmware_py.core.rotations",
     "firmware_py.core.thruster", "firmware_py.core.missing_thrust", "firmware_py.core.body", "firmware_py.prepare.assembly",
@@ -212,7 +212,7 @@ def start(name: str, tree: ast.Module, quiet: bool) -> int:
         sink = os.open(os.devnull, os.O_WRONLY)
         os.dup2(sink, 1)
         os.dup2(sink, 2)
-    signal.alarm(TIMEOUT_S)
+    signal.setitimer(signal.ITIMER_PROF, TIMEOUT_S)
     status = 99
     try:
         import pytest
