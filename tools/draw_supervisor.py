@@ -24,12 +24,35 @@ NEEDS = """\
 Attitude comes from tags, or from gravity until the first tag: one second after a start without tags roll and pitch are known, and ten tags
 that agree give position and heading. Position comes from tags only. SURFACE without an attitude pushes up along the body's own axis.
 The pilot counts as lost once stick input was received and then stopped; if none was ever received, the sticks are neutral, and the first
-input that arrives counts."""
-WHILE_TESTED = """\
+input that arrives counts. A ground station, too, is lost only once one was heard."""
+COUNTING = """\
+Most severe first, with the default parameters (`failsafes.NAME_limit`, `_delay_s`, `_action`, `_latched`). "always" is in every mode, and
+while disarmed; the others count only while armed. In a mode marked "by a fail-safe" one counts only if a fail-safe and not a person chose
+that mode, and where it "only warns" its action does not apply. While a fail-safe with another action than warn is on, the body is not armed
+(forced arming skips this)."""
+WATCHED = """\
+- `module_silent`: no frame of a module comes, or it reports that it hears no commands (TIMEOUT in MCU_STATUS).
+- `thruster_lost`: a thruster is left out because its ESC failed, or because it stands still, does not obey, or does not push as it says
+  (`faults.*`). It is used again once the body is disarmed, its failed ESC has been well for a second, or the robot is pushed as much
+  without it, so that it was not the cause. Thrusters that are left out with their silent module do not count.
+- `fence`: it counts only where the body goes by itself. A body that it stops holds its place where it is.
+- `collision`: the time that is left before the body must brake, to stop before another body of the same fleet towards which it moves or
+  wants to move. Both must have seen tags, and near each other by more than 8 cm/s, 4 cm/s of it by the body's own motion. The two bodies
+  of a dock do not count for each other, nor do the two pieces of an undock for three seconds. In DOCK a body waits for others by itself.
+- `ground_lost`: the ground station that is watched ([ground-station.md](ground-station.md#connect))."""
+AFTERWARDS = """\
+A fail-safe forbids other modes only among those in which it is active: while the pilot is silent, AUTO may be chosen.
+
+When a fail-safe is over, the body stays in the mode that it chose until a person selects one; selecting the same one makes it the person's
+own. If a person had chosen the mode before, and the fail-safe did not change it, it is that person's choice again. A person who selects
+another mode while the cause lasts keeps control until the next fail-safe begins; then the gravest one that is on acts.
+
 In MOTOR_DETECT a body is disarmed instead, whatever the action, if a motor test armed it or it never saw a tag: it may lie on a bench. A
 cause that returns before its fail-safe has ended acts again after its delay. A disarmed or stopped body keeps the mode that a person chose;
-after a motor test, a dock or a fail-safe's mode it goes to POSHOLD. If a person chose a mode and the fail-safes did not
-change it, it counts as that person's choice again when they are over."""
+after a motor test, a dock or a fail-safe's mode it goes to POSHOLD."""
+
+ALWAYS = frozenset(Mode).intersection(*(modes for level, modes in PERMITTED.items() if level < Level.DISARM))
+"""Modes that no fail-safe forbids: with DISARM there is no armed body to select one."""
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -72,10 +95,10 @@ def transitions() -> list[str]:
 def modes() -> list[str]:
     """Table of what each mode needs."""
     rows = [
-        (row.mode.name, str(int(row.mode)), ", ".join(words(n.name) for n in sorted(row.needs)), "yes" if row.by_pilot else "")
+        (row.mode.name, str(int(row.mode)), ", ".join(words(n.name) for n in sorted(row.needs)), "yes" if row.mode in ALWAYS else "")
         for row in MODE_TABLE
     ]
-    return [*table(("mode", "number", "needs", "a pilot may always select it"), rows), NEEDS, ""]
+    return [*table(("mode", "number", "needs", "may be selected whatever fail-safe is on"), rows), NEEDS, ""]
 
 
 def arming() -> list[str]:
@@ -102,7 +125,7 @@ def failsafes() -> list[str]:
         watch = Watch(row, parameters)
         limit = f"{'<' if row.below else '>'} {watch.limit:g}" if hasattr(parameters, f"{row.name}_limit") else "yes"
         delay = f"{getattr(parameters, f'{row.name}_delay_s'):g} s"
-        ends = "disarming" if watch.latched else f"cause gone for {parameters.clear_s:g} s"
+        ends = f"cause gone for {parameters.clear_s:g} s{', disarmed' if watch.latched else ''}"
         says = (row.words + row.detail).format(float("nan")).replace("nan", "N")
         rows.append((f"`{row.name}`", says, limit, delay, words(watch.level.name), ends, counts_in(row)))
     return table(("fail-safe", "text", "limit", "delay", "action", "ends by", "active in"), rows)
@@ -127,8 +150,8 @@ def page() -> str:
         "## States", "", *diagram(), "All transitions; a request without a row is refused with a text.", "", *transitions(),
         "## Modes", "", *modes(), "## Arming checks", "", *arming(),
         "## Fail-safes", "",
-        "Most severe first, with the default parameters (`failsafes.NAME_limit`, `_delay_s`, `_action`, `_latched`).", "",
-        *failsafes(), "### Actions", "", *permitted(), WHILE_TESTED,
+        COUNTING, "",
+        *failsafes(), WATCHED, "", "### Actions", "", *permitted(), AFTERWARDS,
     ]  # fmt: skip
     return "\n".join(lines).rstrip() + "\n"
 
