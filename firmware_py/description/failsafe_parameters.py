@@ -81,7 +81,8 @@ class Failsafes:
     axis_lost_latched: int = latched(1, "FS_AXIS_LAT")
     # depth unknown
     depth_unknown_limit: float = quantity(
-        5.0, unit="s", low=0.1, high=600, help="longest permitted time with neither a pressure reading nor a tag", mavlink="FS_DEPU_LIM"
+        5.0, unit="s", low=0.1, high=600,
+        help="longest permitted time with neither a trusted pressure reading nor a tag, or without an attitude", mavlink="FS_DEPU_LIM"
     )
     depth_unknown_delay_s: float = delay(0.0, "FS_DEPU_S")
     depth_unknown_action: int = action(4, "FS_DEPU_ACT")
@@ -141,7 +142,7 @@ class Failsafes:
     tag_late_latched: int = latched(0, "FS_TAGM_LAT")
     # pressure sensor lost
     depth_lost_limit: float = quantity(
-        1.0, unit="s", low=0.1, high=60, help="longest permitted time without a pressure reading", mavlink="FS_DEPL_LIM"
+        1.0, unit="s", low=0.1, high=60, help="longest permitted time without a trusted pressure reading", mavlink="FS_DEPL_LIM"
     )
     depth_lost_delay_s: float = delay(0.0, "FS_DEPL_S")
     depth_lost_action: int = action(1, "FS_DEPL_ACT")
@@ -154,9 +155,10 @@ class Failsafes:
     imu_lost_delay_s: float = delay(0.0, "FS_IMU_S")
     imu_lost_action: int = action(2, "FS_IMU_ACT")
     imu_lost_latched: int = latched(0, "FS_IMU_LAT")
-    # a CAN node is silent
+    # a CAN node is silent, or hears no commands
     module_silent_limit: float = quantity(
-        0.5, unit="s", low=0.1, high=60, help="longest permitted silence of a single module", mavlink="FS_MOD_LIM"
+        0.5, unit="s", low=0.1, high=60,
+        help="longest permitted time in which a single module is silent, or reports that it hears no commands", mavlink="FS_MOD_LIM"
     )
     module_silent_delay_s: float = delay(0.0, "FS_MOD_S")
     module_silent_action: int = action(2, "FS_MOD_ACT")
@@ -170,7 +172,9 @@ class Failsafes:
     ticks_missed_latched: int = latched(0, "FS_TICK_LAT")
     # outside the fence. A body that holds a place on it moves about that place by millimetres, and a mission's item may lie 20 mm beyond
     fence_limit: float = quantity(
-        0.05, unit="m", low=0, high=10, help="largest permitted distance of the body beyond the fence", mavlink="FS_FENC_LIM"
+        0.05, unit="m", low=0, high=10,
+        help="largest permitted distance of the body beyond the fence; counts also in an ALT_HOLD that a fail-safe chose",
+        mavlink="FS_FENC_LIM",
     )
     fence_delay_s: float = delay(0.2, "FS_FENC_S")
     fence_action: int = action(2, "FS_FENC_ACT")
@@ -178,26 +182,29 @@ class Failsafes:
     # another body is in the way; docks and undocks give way by themselves. The delay takes half of the limit, the other half is margin
     collision_limit: float = quantity(
         0.2, unit="s", low=0, high=60,
-        help="least permitted time until the body must brake to stop before another one towards which it moves", mavlink="FS_COL_LIM"
+        help="least permitted time until the body must brake to stop before another towards which it moves or wants to; 0: not watched",
+        mavlink="FS_COL_LIM",
     )
     collision_delay_s: float = delay(0.1, "FS_COL_S")
     collision_action: int = action(2, "FS_COL_ACT")
     collision_latched: int = latched(0, "FS_COL_LAT")
     # ground station lost
     ground_lost_limit: float = quantity(
-        5.0, unit="s", low=0.5, high=600, help="longest permitted silence of the ground station", mavlink="FS_GCS_LIM"
+        5.0, unit="s", low=0.5, high=600,
+        help="longest permitted silence of the ground station that is watched, once one was heard", mavlink="FS_GCS_LIM"
     )
     ground_lost_delay_s: float = delay(0.0, "FS_GCS_S")
     ground_lost_action: int = action(2, "FS_GCS_ACT")
     ground_lost_latched: int = latched(0, "FS_GCS_LAT")
     # pilot input lost
     pilot_lost_limit: float = quantity(
-        1.0, unit="s", low=0.1, high=60, help="longest permitted time without stick input", mavlink="FS_RC_LIM"
+        1.0, unit="s", low=0.1, high=60, help="longest permitted time without stick input, once there was some", mavlink="FS_RC_LIM"
     )
     pilot_lost_delay_s: float = delay(0.0, "FS_RC_S")
     pilot_lost_action: int = action(2, "FS_RC_ACT")
     pilot_lost_latched: int = latched(0, "FS_RC_LAT")
-    # a thruster is dead or lies: it counts as that until the body is disarmed, or the thruster acquitted (core.thruster_trial)
+    # a thruster is dead or lies: it counts as that until the body is disarmed, the thruster acquitted (core.thruster_trial), or its failed
+    # ESC well again
     thruster_lost_delay_s: float = delay(0.0, "FS_THR_S")
     thruster_lost_action: int = action(1, "FS_THR_ACT")
     thruster_lost_latched: int = latched(0, "FS_THR_LAT")

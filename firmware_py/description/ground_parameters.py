@@ -31,7 +31,7 @@ class Ground:
         unit="s",
         low=0.5,
         high=600,
-        help="silence of the watched ground station after which another may take its place",
+        help="silence of the watched ground station after which another may take its place; keep it below FS_GCS_LIM",
         mavlink="GCS_WATCH",
     )
     mission_speed_m_s: float = quantity(

@@ -152,7 +152,8 @@ class Limiter:
         200.0, unit="N/s", low=1, high=1e4, help="slew rate limit of a thruster's force", mavlink="LIM_SLEW"
     )
     relay_on_s: float = quantity(
-        60.0, unit="s", low=1, high=3600, help="longest time that a cold docking magnet may stay on", mavlink="LIM_MAG_ON"
+        60.0, unit="s", low=1, high=3600,
+        help="longest time that a cold docking magnet may stay on; without effect while relay_duty is 1", mavlink="LIM_MAG_ON"
     )
     relay_duty: float = quantity(
         1.0, low=0.01, high=1, help="largest long-term duty cycle of a docking magnet", mavlink="LIM_MAG_DUTY"
@@ -183,7 +184,7 @@ class Supervision:
         unit="ms",
         low=5,
         high=5000,
-        help="timeout after which a module that does not answer counts as silent",
+        help="timeout after which a module that does not answer counts as silent for arming",
         mavlink="ARM_ANSWER_MS",
     )
     esc_fresh_ms: float = quantity(
