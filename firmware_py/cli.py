@@ -65,7 +65,10 @@ def run(
         typer.Option(parser=folder_of, metavar="DIR", help="folder for the logs; if it holds one already, subfolder 0002, 0003, ..."),
     ] = None,
     ground: Annotated[
-        list[str] | None, typer.Option(help="link to ground stations: udpout:, udpin:, tcpin:HOST:PORT, /dev/NAME,BAUD")
+        list[str] | None,
+        typer.Option(
+            help="link to ground stations: udpout:, udpin:, tcpin:HOST:PORT, /dev/NAME,BAUD; +trusted behind it: may set the signing key"
+        ),
     ] = None,
     identity: Annotated[
         str | None, typer.Option(help="modes shown to ground stations: generic (PX4's) or ardusub", show_default="generic")

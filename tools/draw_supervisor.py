@@ -35,7 +35,8 @@ WATCHED = """\
 - `thruster_lost`: a thruster is left out because its ESC failed, or because it stands still, does not obey, or does not push as it says
   (`faults.*`). It is used again once the body is disarmed, its failed ESC has been well for a second, or the robot is pushed as much
   without it, so that it was not the cause. Thrusters that are left out with their silent module do not count.
-- `fence`: it counts only where the body goes by itself. A body that it stops holds its place where it is.
+- `fence`: it counts only where the body goes by itself. A body that it stops holds its place where it is. In an ALT_HOLD that a fail-safe
+  chose it only tells, unless its action is graver than that fail-safe's.
 - `collision`: the time that is left before the body must brake, to stop before another body of the same fleet towards which it moves or
   wants to move. Both must have seen tags, and near each other by more than 8 cm/s, 4 cm/s of it by the body's own motion. The two bodies
   of a dock do not count for each other, nor do the two pieces of an undock for three seconds. In DOCK a body waits for others by itself.
