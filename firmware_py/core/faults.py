@@ -48,16 +48,16 @@ CLEAR = 4.0
 just about to start."""
 SILENT_NS = 500_000_000
 """Silence, or deafness, after which a module's thrusters are excluded, if the others can make every wrench without them; the fail-safe
-`module_silent` acts then too. A silent module that hears nothing either has stopped its thrusters after 100 ms (DESIGN's bus); one that
-still hears stops them because of the exclusion."""
+`module_silent` acts then too. A silent module that hears nothing either has stopped its thrusters after 100 ms (can_dbc/README.md); one
+that still hears stops them because of the exclusion."""
 WELL_AGAIN = 10
 """Feedbacks in a row without a fault, one second's, after which a thruster whose ESC had failed is used again."""
 BELIEVED_NS = 500_000_000
 """How long believed forces are kept: the feedback of a module whose answers come late is compared with those of its own time. Against the
 present ones, propellers that reverse seemed to disobey where frames were 30 ms late each way."""
 FEEDBACK_WEIGHT = 0.3
-"""Weight of one ESC feedback in the running share of force that a thruster reports. Ten come per second (DESIGN's bus), which gives a
-memory of 0.3 s: less than the half second of motion that core.missing_thrust judges."""
+"""Weight of one ESC feedback in the running share of force that a thruster reports. Ten come per second (can_dbc/modcube.dbc), which gives
+a memory of 0.3 s: less than the half second of motion that core.missing_thrust judges."""
 
 
 class ThrusterFaults(NamedTuple):

@@ -25,8 +25,8 @@ from firmware_py.description.parameters import Parameters
 
 ZERO, DOWN = np.zeros(3), np.array([0.0, 0.0, 1.0])
 STILL_S = COMMAND_TIMEOUT_NS / 1e9
-"""Longest gap between two ticks. After a longer one the microcontrollers have stopped all thrust (DESIGN), and the set-point restarts from
-the body."""
+"""Longest gap between two ticks. After a longer one the microcontrollers have stopped all thrust (can_dbc/README.md), and the set-point
+restarts from the body."""
 NEAR_M, NEAR_RAD = 0.2, 0.35
 """Largest distance, in m and rad, between set-point and body at which the set-point continues from where it is; otherwise it restarts from
 the body."""

@@ -30,7 +30,7 @@ GYRO_BIASES, ACCEL_BIASES, DEPTH_BIASES = 0.1, 1.0, 0.5
 failed sensor reads zeros or its limit, off by gravity, until it is found."""
 PRESSURE_SILENT_NS = 100_000_000
 """Time without a reading, while others are heard, after which a pressure sensor counts as silent: five times its period (DEPTH comes at
-50 Hz, DESIGN's bus)."""
+50 Hz, can_dbc/modcube.dbc)."""
 STILL_RAD_S = 0.05
 """Angular rate below which centripetal acceleration is negligible at any IMU in the body: 0.75 mm/s^2 over 0.3 m."""
 

@@ -21,7 +21,7 @@ CHANNELS, FACES = MOST_THRUSTERS, 6
 RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
 """States of a docking relay, as DOCK_CMD has them."""
 COMMAND_TIMEOUT_NS = 100_000_000
-"""Time without commands after which a module's microcontroller stops its thrusters (DESIGN's bus)."""
+"""Time without commands after which a module's microcontroller stops its thrusters (can_dbc/README.md)."""
 MCU_TIMED_OUT, MCU_ESTOP = 3, 4
 """MCU_STATUS states of a module whose thrusters stand still: it hears no commands, or is held by an e-stop."""
 MCU_UNFIT = (0, MCU_TIMED_OUT, 5)
