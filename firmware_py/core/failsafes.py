@@ -40,7 +40,7 @@ TRUSTING = frozenset({Mode.ALT_HOLD, Mode.STABILIZE})
 """Modes that hold depth or attitude by the estimate for a pilot: if it contradicts the tags, he is told, and keeps control."""
 PILOTED = frozenset(row.mode for row in MODE_TABLE if row.by_pilot)
 UNSTOPPED = PILOTED | {Mode.SURFACE}
-"""Modes in which nothing stops a body short of disarming it: a pilot's, and the way up."""
+"""Modes that may be entered whatever fail-safe is on, and in which a body does not stop for others: a pilot's, and the way up."""
 
 PERMITTED = {
     Level.NONE: ANY,
