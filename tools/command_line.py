@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import math
 import os
 import signal
 import sys
@@ -17,15 +18,28 @@ from typing import Any, NoReturn
 
 REASONS = {errno.EEXIST: "is a file; a folder is needed"}
 """Replacements for system error messages that do not say what is needed."""
+NO_VALUES = (None, argparse.SUPPRESS, "", [], math.inf)
+"""Defaults that stand for nothing, or for no limit."""
 INTERRUPTED = 130
 """Exit status after Ctrl-C: 128 + SIGINT, as in a shell."""
+
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Shows the description as written, and behind the text of an option the value that it has when it is left out."""
+
+    def _get_help_string(self, action: argparse.Action) -> str:
+        text, default = action.help or "", action.default
+        if action.nargs == 0 or default in NO_VALUES or "default" in text:
+            return text
+        values = default if isinstance(default, list) else [default]
+        return f"{text} [default: {' '.join(map(str, values)).replace('%', '%%')}]"
 
 
 class Parser(argparse.ArgumentParser):
     """Reports wrong arguments in one line with exit status 2. Shows its description as written."""
 
     def __init__(self, **how: Any) -> None:
-        super().__init__(formatter_class=argparse.RawDescriptionHelpFormatter, **how)
+        super().__init__(formatter_class=_Help, **how)
 
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog.removesuffix('.py')}: {message}; see --help\n")

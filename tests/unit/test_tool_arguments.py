@@ -46,6 +46,19 @@ def test_help_says_what_a_tool_does_and_does_nothing(run: Run, tool: str, capsys
     assert "usage: " in capsys.readouterr().out
 
 
+def test_help_tells_the_value_of_every_option_that_is_left_out(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    """Not of one whose text tells it already, nor of one without a value to tell."""
+    assert run("identify", "--help") == 0
+    found = " ".join(capsys.readouterr().out.split())
+    assert "free space to either side, world x y z [default: 0.6 0.5 0.3]" in found
+    assert "folder for the results [default: runs/identify]" in found
+    assert "first one is 1 (default) --accuracy PERCENT" in found and "[default: ]" not in found and "[default: None]" not in found
+    assert run("tune_gains", "--help") == 0
+    found = " ".join(capsys.readouterr().out.split())
+    assert "number of parallel processes [default: 2]" in found
+    assert "after which no new trial starts --jobs" in found and "do not draw plots --live" in found, "for ever, and a switch"
+
+
 @pytest.mark.parametrize(
     ("tool", "arguments", "refusal"),
     [
