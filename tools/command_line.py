@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 
 REASONS = {errno.EEXIST: "is a file; a folder is needed"}
 """Replacements for system error messages that do not say what is needed."""
-NO_VALUES = (None, argparse.SUPPRESS, "", [], math.inf)
+NO_VALUES: tuple[object, ...] = (None, argparse.SUPPRESS, "", [], math.inf)
 """Defaults that stand for nothing, or for no limit."""
 INTERRUPTED = 130
 """Exit status after Ctrl-C: 128 + SIGINT, as in a shell."""

@@ -189,7 +189,10 @@ class Supply:
     voltage_v: float = quantity(12.0, unit="V", low=1.0, high=400.0, help="nominal voltage")
     current_a: float = quantity(10.0, unit="A", low=0.1, high=1000.0, help="largest current of the supply")
     idle_w: float = quantity(8.0, unit="W", low=0.0, high=1000.0, help="power drawn by the electronics")
-    magnet_w: float = quantity(6.0, unit="W", low=0.0, high=500.0, help="power drawn by one energised docking magnet")
+    magnet_w: float = quantity(
+        6.0, unit="W", low=0.0, high=500.0,
+        help="power drawn by one energised docking magnet; simulated only, the controller goes by LIM_MAG_W",
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
