@@ -62,11 +62,11 @@ def times_to_brake(
         if set(pair) <= set(numbers):
             a, b = map(numbers.index, pair)
             ignored[a, b] = ignored[b, a] = True
-    modules = [_in_world(*estimates[body.index][:3], body.r_bm, body.hull_m) for body in placed]
+    modules = [in_world(*estimates[body.index][:3], body.r_bm, body.hull_m) for body in placed]
     of_body = np.repeat(np.arange(len(placed)), [len(body.modules) for body in placed])
     r_w, v_w, cylinder = map(np.concatenate, zip(*modules, strict=True))
     wanted = np.array([wanted_w[number] for number in numbers])
-    nu = np.array([estimates[number].nu for number in numbers]).reshape(-1, 2, 3)
+    nu = np.array([estimates[number].nu for number in numbers]).reshape(len(placed), 2, 3)
     deceleration = np.array([body.deceleration for body in placed])
     own, asked = np.linalg.norm(nu, axis=2), np.zeros((len(placed), 2))
     asked[:, 0] = np.linalg.norm(wanted, axis=1)
@@ -78,7 +78,7 @@ def times_to_brake(
 
 
 @njit(f"Tuple(({M},{M},{M}))({V},{V},{V},{M},{M})", cache=True)
-def _in_world(p_wb, q_wb, nu, r_bm, hull_m):  # type: ignore[no-untyped-def]
+def in_world(p_wb, q_wb, nu, r_bm, hull_m):  # type: ignore[no-untyped-def]
     """(m, 3) places of a body's modules, m, (m, 3) their velocities, m/s, world, and (m, 2) radius and half the height of the upright
     cylinders about their hulls, m.
     """
@@ -95,7 +95,7 @@ def _in_world(p_wb, q_wb, nu, r_bm, hull_m):  # type: ignore[no-untyped-def]
 
 
 @njit("UniTuple(float64,2)(float64,float64,float64)", cache=True)
-def _within(excess, rate, speed2):  # type: ignore[no-untyped-def]
+def within(excess, rate, speed2):  # type: ignore[no-untyped-def]
     """Times from when to when excess + 2 rate t + speed2 t^2 is at most 0; infinity to minus infinity if it never is."""
     if speed2 < 1e-12:
         return (-math.inf, math.inf) if excess <= 0.0 else (math.inf, -math.inf)
@@ -110,7 +110,7 @@ def _soonest(r_w, own_w, v_w, cylinder, of_body, ignored):  # type: ignore[no-un
     """(b,) the least time to collision over all pairs of modules of two bodies, s; NaN where there is none. Each body moves at `own_w`,
     (m, 3), while the others move at `v_w`, (m, 3).
     """
-    out = np.full(ignored.shape[0], np.nan)
+    out = np.full(len(ignored), np.nan)
     for i in range(of_body.size):
         for j in range(of_body.size):
             if ignored[of_body[i], of_body[j]]:
@@ -122,9 +122,9 @@ def _soonest(r_w, own_w, v_w, cylinder, of_body, ignored):  # type: ignore[no-un
             distance = math.sqrt(level2 + down2)
             if -level_rate - down_rate > CLOSING_M_S * distance and own > OWN_M_S * distance:  # not where it is NaN
                 radius_m, height_m = cylinder[i, 0] + cylinder[j, 0], cylinder[i, 1] + cylinder[j, 1]
-                beside = _within(level2 - radius_m**2, level_rate, v_n**2 + v_e**2)
-                above = _within(down2 - height_m**2, down_rate, v_d**2)
+                beside = within(level2 - radius_m**2, level_rate, v_n**2 + v_e**2)
+                above = within(down2 - height_m**2, down_rate, v_d**2)
                 begins = max(beside[0], above[0], 0.0)
-                if begins <= min(beside[1], above[1]) and not begins >= out[of_body[i]]:
-                    out[of_body[i]] = begins
+                if begins <= min(beside[1], above[1]):
+                    out[of_body[i]] = np.fmin(out[of_body[i]], begins)
     return out
