@@ -437,16 +437,23 @@ def test_push_is_told_as_the_current_that_would_push_so_sideways_on_the_mean_of_
     push_n = BODY.drag.mean * current_m_s**2
     force = push_n * np.array([0.6, -0.8, 0.0]) + np.array([0.0, 0.0, 50.0])
     bench.step()
-    assert bench.wait(1.0, force_w=force).push_m_s == pytest.approx(current_m_s * math.sqrt(1.0 - math.exp(-1.0)))
+    assert bench.step(force_w=force).push_m_s == pytest.approx(current_m_s * math.sqrt(1.0 - math.exp(-0.01)))
+    assert bench.wait(0.99, force_w=force).push_m_s == pytest.approx(current_m_s * math.sqrt(1.0 - math.exp(-1.0)))
     assert bench.wait(9.0, force_w=force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
     assert bench.step(force_w=-force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
 
 
-def test_push_upon_a_body_whose_drag_is_linear_too_is_no_more_current_than_there_is() -> None:
+@pytest.mark.parametrize("speed_m_s", [0.0, 0.3, -0.3])
+def test_push_upon_a_body_whose_drag_is_linear_too_is_no_more_current_than_there_is(speed_m_s: float) -> None:
     body, current_m_s = assemble([(0, 0, 0)], [0], [load_vehicle("bluerov2")], [1]), 0.4
-    bench, push_n = MonitorBench(body), body.drag.mean * current_m_s**2 + body.drag.linear[:3].mean() * current_m_s
+
+    def drag_n(v_m_s: float) -> float:
+        return body.drag.mean * v_m_s * abs(v_m_s) + float(body.drag.linear[:3].mean()) * v_m_s
+
+    bench, push_n = MonitorBench(body), drag_n(speed_m_s) - drag_n(speed_m_s - current_m_s)
     bench.step()
-    assert bench.wait(9.0, force_w=np.array([push_n, 0.0, 0.0])).push_m_s == pytest.approx(current_m_s, rel=1e-3)
+    moves = np.array([speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert bench.wait(9.0, force_w=np.array([push_n, 0.0, 0.0]), nu=moves).push_m_s == pytest.approx(current_m_s, rel=1e-3)
 
 
 @pytest.mark.parametrize("speed_m_s", [-0.2, 0.3, 0.9])
