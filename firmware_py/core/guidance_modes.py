@@ -116,7 +116,8 @@ class Guidance:
         self._full_stick = p.stick_share * self._body.thrusters.full_wrench
         self._lift_n = p.surface_force_n * len(self._body.modules)
         depth_m = self._body.r_bm[:, 2]
-        self._surface_m = p.surface_depth_m + float(depth_m.mean() - depth_m.min())  # the highest module is to be at the surface
+        at_surface_m = p.surface_depth_m + float(depth_m.mean() - depth_m.min())  # the highest module is to be at the surface
+        self._surface_m = max(at_surface_m, float((0.5 * self._body.hull_m[:, 2] - depth_m).max()))  # with its hull in the water
         self._glider.retune(p.bandwidth, p.speed_m_s, p.rate_rad_s)
 
     def drop_stale_goals(self, estimate: Estimate, health: Health) -> None:

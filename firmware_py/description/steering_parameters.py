@@ -57,7 +57,8 @@ class Steering:
     )
     surface_speed_m_s: float = quantity(0.10, unit="m/s", low=0.01, high=2, help="ascent speed in SURFACE", mavlink="SURF_SPEED")
     surface_depth_m: float = quantity(
-        0.12, unit="m", low=0, high=10, help="depth of the (highest docked) module's centre of mass at the surface", mavlink="SURF_DEPTH"
+        0.12, unit="m", low=0, high=10,
+        help="depth of the (highest docked) module's centre of mass at the surface; a taller hull stays in the water", mavlink="SURF_DEPTH"
     )
     surface_force_n: float = quantity(
         3.0, unit="N", low=0, high=1000,

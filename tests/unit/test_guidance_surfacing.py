@@ -1,5 +1,7 @@
 """Guidance of a robot that surfaces, and of one whose world frame moves when tags appear, vanish and return."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,7 @@ from firmware_py.core.transitions import Effect
 from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare.assembly import assemble
+from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from tests.unit.guidance_flight import LEVEL, WRENCH, ZERO, Flight, estimate
 from tests.unit.healths import BLIND, GOOD, UPRIGHT
 
@@ -59,6 +61,22 @@ def test_stacked_robot_stays_with_its_highest_module_at_the_surface() -> None:
     flight.do(Effect.ENTER_MODE, Mode.SURFACE)
     assert flight.run(40.0).p_wb[2] == pytest.approx(Parameters().steering.surface_depth_m + 0.21, abs=1e-3)
     assert rotate(flight.estimate.q_wb, flight.wrenches[-1][:3].copy())[2] == pytest.approx(-4.5), "1.5 N for each module"
+
+
+@pytest.mark.parametrize(("name", "depth_m"), [("modcube", 0.12), ("bluerov2", 0.127), ("girona500", 0.5)])
+def test_tall_robot_comes_up_as_far_as_the_water_carries_its_hull(name: str, depth_m: float) -> None:
+    """A robot of 0.8 m was to come up to 0.12 m too: it held a fifth of a kilonewton of hull out of the water until its battery was low."""
+    flight = Flight(body=assemble_vehicle(load_vehicle(name)))
+    flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+    assert flight.run(40.0).p_wb[2] == pytest.approx(depth_m, abs=1e-3)
+
+
+def test_robot_that_is_heavy_at_the_bottom_has_its_whole_hull_in_the_water_at_the_surface() -> None:
+    robot = load_vehicle("girona500")
+    robot = dataclasses.replace(robot, inertial=dataclasses.replace(robot.inertial, com_m=np.array([0.0, 0.0, 0.2])))
+    flight = Flight(body=assemble_vehicle(robot))
+    flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+    assert flight.run(40.0).p_wb[2] == pytest.approx(0.7, abs=1e-3)
 
 
 @pytest.mark.parametrize("mode", [Mode.STABILIZE, Mode.ALT_HOLD, Mode.SURFACE])
