@@ -150,6 +150,17 @@ def test_vehicle_with_a_passive_degree_of_freedom_is_degenerate_until_it_is_decl
     assert largest_inscribed(torque.normals, torque.offsets).volume > 0.0
 
 
+def test_vehicle_whose_thrusters_do_not_touch_its_passive_axis_is_characterised() -> None:
+    """Four thrusters level with the centre of mass and two above it. Regression: a traceback, for directions of three axes met two."""
+    rov = load_vehicle("bluerov2")
+    level = tuple(dataclasses.replace(t, position_m=t.position_m * [1.0, 1.0, 0.0]) for t in rov.thruster)
+    layout = of_vehicle(dataclasses.replace(rov, thruster=level))
+    found = summary.characterise(layout, count=121)
+    assert found.unreachable == ("pitch",) and found.programs_differ < 1e-6
+    assert found.power["torque"].residual == pytest.approx(1.0, abs=0.01), "a moment about pitch is missed whole"
+    assert found.declared["torque"]["physical"].volume > 0.0
+
+
 @pytest.mark.parametrize(("name", "axis", "passive"), [("bluerov2", 0, 4), ("girona500", 1, 3)])
 def test_axis_that_tilts_a_vehicle_is_pushed_once_the_tilt_is_declared_passive(name: str, axis: int, passive: int) -> None:
     layout = one_of_seven(name)

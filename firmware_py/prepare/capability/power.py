@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import daqp
 import numpy as np
 
-from firmware_py.prepare.capability.layout import Layout
-from firmware_py.prepare.capability.wrench import embed, free_components
+from firmware_py.prepare.capability.layout import FRAMES, Layout
+from firmware_py.prepare.capability.wrench import embed
 
 _EQUALITY = 5
 """daqp's mark of an equality row."""
@@ -28,7 +28,7 @@ class PowerSpace:
 
     Attributes:
         size: |w| of the declared wrench, N or N m.
-        directions: (k, d) unit vectors, d = 3 minus the passive components.
+        directions: (k, 3) unit vectors.
         forces: (k, n) N.
         power_w: (k,) W; NaN where the thrusters' power is not known.
         residual: largest |J f - w| over the directions, N and N m together; zero where the layout spans the frame.
@@ -50,16 +50,16 @@ def power_space(layout: Layout, frame: str, directions: np.ndarray, size: float 
 
     Args:
         frame: of layout.FRAMES.
-        directions: (k, d) unit vectors over the frame's components that are not left out.
+        directions: (k, 3) unit vectors over the frame's components, whatever the thrusters cannot make among them.
         size: |w|, N or N m.
     """
-    components = free_components(layout, frame)
+    components = FRAMES[frame]
     wrenches = size * embed(directions, components)
     pinv = np.linalg.pinv(layout.matrix, rcond=1e-9)
     forces = wrenches @ pinv.T
     residual = np.linalg.norm(forces @ layout.matrix.T - wrenches, axis=1)
     over = np.any((forces > layout.f_max + 1e-9) | (forces < layout.f_min - 1e-9), axis=1)
-    # A unit vector in d dimensions has mean zero and second moment 1/d in each component.
+    # A unit vector in three dimensions has mean zero and second moment 1/3 in each component.
     mean_square = float(np.sum(pinv[:, components] ** 2)) / len(components)
     return PowerSpace(
         size=size,

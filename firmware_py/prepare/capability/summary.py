@@ -159,12 +159,11 @@ def _scaled(reach: Reach, share: float) -> Reach:
 
 def _reach(space: WrenchSpace | ProgramSpace, frame: str, directions: np.ndarray, harmonics: Harmonics) -> Reach:
     section = space.section(frame)
+    full = section is not None and len(section.components) == 3
+    radius = section.reach(directions) if section and full else space.reach(embed(directions, FRAMES[frame]))
     if section is None:
-        radius = space.reach(embed(directions, FRAMES[frame]))
         return Reach(True, None, None, 0.0, 0.0, radius, None)
     ellipsoid = largest_inscribed(section.normals, section.offsets)
-    full = len(section.components) == 3
-    radius = section.reach(directions) if full else np.zeros(len(directions))
     shape = harmonics.shape(radius) if full else None
     return Reach(False, section, ellipsoid, ellipsoid.volume, section.worst(), radius, shape)
 
