@@ -23,7 +23,7 @@ from pathlib import Path
 from command_line import Parser, refuse, run_tool
 
 from argument_types import check_results, folder_for_results
-from identify_excitation import MOTIONS, SPACE_M, check_space, excitation, why_no_roll
+from identify_excitation import MOTIONS, SPACE_M, check_space, excitation, is_seen_from_above, why_no_roll
 from identify_fit import Fit, Reference, fit
 from identify_log import Recording, read_recording
 from identify_model import Equations, Weight
@@ -115,7 +115,9 @@ def write_excitation(path: Path, motions: Sequence[str], vehicle: Vehicle, name:
         name: of the vehicle, or its file.
     """
     no_roll = why_no_roll(vehicle) if "turning" in motions else ""
-    path.write_text(excitation(motions, name, space_m, no_roll=no_roll), encoding="utf-8")
+    path.write_text(excitation(motions, name, space_m, no_roll=no_roll, curve=vehicle.curve), encoding="utf-8")
+    if not is_seen_from_above(vehicle):
+        print(f"its camera looks down, and {vehicle.name} has no tag on top: put yours in its place, and leave out turns that hide the tag")
     if no_roll:
         print(f"left out: roll, because {no_roll}")
     print(f"fly it: .venv/bin/modcube hil run {shlex.quote(str(path))}")

@@ -9,7 +9,7 @@ import numpy as np
 
 from firmware_py.core.rotations import to_matrix
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle import ThrusterCurve, Vehicle
 
 SPACE_M = (0.6, 0.5, 0.3)
 """Default travel to either side of the middle: keeps the peaks below 0.45 m/s and 0.35 m/s^2."""
@@ -21,6 +21,8 @@ YAW_TURNS, ROLL_TURNS = 0.81, 0.57
 """Turns per round: each peaks at half a rad/s; in slower turning the damping hides the inertia."""
 SEEN_DEG, LOOKS = 60.0, 72
 """Incidence up to which a tag counts as seen, less than the 65 deg at which a reading ends; and roll angles that are looked at."""
+DEADBANDS = (0.10 / 0.17, 0.25 / 0.17)
+"""Least and largest deadband of the bench's thrusters, over that of the vehicle file: those of the bench, for a module's 0.17 N."""
 MOTIONS: Mapping[str, tuple[tuple[int, ...], bool]] = {
     "along x": ((0,), False),
     "along y": ((1,), False),
@@ -70,6 +72,12 @@ high = 0.01
 metric = "warnings"
 high = 0.0
 """
+WORLD = """
+[world]                 # the bench's thrusters as the vehicle's
+thruster_lag_s = {lag:g}
+deadband_low_n = {low:.3g}
+deadband_high_n = {high:.3g}
+"""
 
 
 def check_space(space_m: Sequence[float]) -> None:
@@ -80,6 +88,11 @@ def check_space(space_m: Sequence[float]) -> None:
 
 def _words(space_m: Sequence[float]) -> str:
     return " ".join(f"{free:g}" for free in space_m)
+
+
+def is_seen_from_above(vehicle: Vehicle) -> bool:
+    """Whether the flight's camera sees a tag of the vehicle while that is level."""
+    return any(to_matrix(tag.quaternion.copy())[2, 2] >= math.cos(math.radians(SEEN_DEG)) for tag in vehicle.tag)
 
 
 def why_no_roll(vehicle: Vehicle) -> str:
@@ -94,13 +107,19 @@ def why_no_roll(vehicle: Vehicle) -> str:
 
 
 def excitation(
-    motions: Collection[str], vehicle: str, space_m: Sequence[float] = SPACE_M, duration_s: float = 170.0, no_roll: str = ""
+    motions: Collection[str],
+    vehicle: str,
+    space_m: Sequence[float] = SPACE_M,
+    duration_s: float = 170.0,
+    no_roll: str = "",
+    curve: ThrusterCurve | None = None,
 ) -> str:
     """TOML text of a scenario that makes the `motions` (keys of MOTIONS). Raises DescriptionError where one has no room.
 
     Args:
         vehicle: name or file. space_m: (3,) how far the vehicle may go to either side of the middle, along each world axis.
         no_roll: why the vehicle turns about the vertical alone, if so.
+        curve: of the vehicle's thrusters, whose lag and deadband the bench's then have; None: the bench's own.
     """
     check_space(space_m)
     axes = {axis for motion in motions for axis in MOTIONS[motion][0]}
@@ -110,7 +129,7 @@ def excitation(
         raise DescriptionError(f"--space {_words(space_m)} leaves no room along {narrow}; give what is free to either side, m")
     reach = np.array([a / full for a, full in zip(amplitude, SPACE_M, strict=True) if a > 0.0])
     rounds = RATE_HZ * duration_s / math.sqrt(reach.max() if reach.size else 1.0)
-    return TEMPLATE.format(
+    text = TEMPLATE.format(
         why=", ".join(motion for motion in MOTIONS if motion in motions),
         vehicle=vehicle,
         duration=duration_s,
@@ -121,3 +140,7 @@ def excitation(
         roll=ROLL_TURNS if turns and not no_roll else 0.0,
         left_out=f" without roll: {no_roll}" if no_roll else "",
     )
+    if curve is None:
+        return text
+    low, high = (share * curve.deadband_n for share in DEADBANDS)
+    return text + WORLD.format(lag=curve.lag_s, low=low, high=high)

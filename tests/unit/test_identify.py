@@ -2,6 +2,7 @@
 
 import dataclasses
 import sys
+import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,6 +24,7 @@ from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import Payload, Vehicle, load_vehicle, vehicle_names
 from firmware_py.description.water import GRAVITY
 from firmware_py.prepare.assembly import assemble_vehicle
+from hil.plant.spec import WorldSpec
 from hil.scenario import load_scenario
 
 
@@ -117,6 +119,29 @@ def test_vehicle_rolls_only_where_the_camera_keeps_a_tag_in_sight(
     file.write_text(excitation.excitation(["turning"], "modcube", no_roll=no_roll))
     task = load_scenario(str(file)).task
     assert task.yaw_turns and bool(task.roll_turns) is not bool(why)
+
+
+def test_excitation_is_flown_with_thrusters_as_the_vehicle_has_them() -> None:
+    """Those of the bench are a module's: a vehicle of 0.05 s and 0.03 N lost a healthy thruster and its way in this flight."""
+    bench, quick = load_vehicle("modcube").curve, dataclasses.replace(load_vehicle("modcube").curve, lag_s=0.05, deadband_n=0.034)
+    worlds = [tomllib.loads(excitation.excitation(["turning"], "modcube", curve=curve)).get("world") for curve in (None, bench, quick)]
+    assert worlds[0] is None
+    assert worlds[1] == {name: getattr(WorldSpec(), name) for name in ("thruster_lag_s", "deadband_low_n", "deadband_high_n")}
+    assert worlds[2] == {"thruster_lag_s": 0.05, "deadband_low_n": 0.02, "deadband_high_n": 0.05}
+
+
+@pytest.mark.parametrize(("face", "said"), [(0, True), (5, False)])
+def test_excitation_of_a_vehicle_without_a_tag_on_top_says_whose_camera_is_wanted(
+    face: int, said: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was never armed in that flight, for want of a pose."""
+    monkeypatch.chdir(tmp_path)
+    whole = load_vehicle("modcube")
+    Path("one.toml").write_text(to_toml(dataclasses.replace(whole, tag=(whole.tag[face],))), encoding="utf-8")
+    monkeypatch.setattr(sys, "argv", ["identify", "--excitation", "shake.toml", "--vehicle", "one.toml"])
+    assert tool.main() == 0
+    assert ("its camera looks down, and modcube has no tag on top: put yours in its place" in capsys.readouterr().out) is said
+    assert load_scenario("shake.toml").world.thruster_lag_s == whole.curve.lag_s
 
 
 def test_smaller_room_is_kept_and_shaken_faster() -> None:
