@@ -54,7 +54,8 @@ SIGNIFICANT = 20.0
 CROSS_SHARE = 1.0 / 9.0
 """Mean square distance of the hull from a rotation axis, as a share of the body's squared reach: L^2 / 12 for a cube of edge L. A body
 that turns under way meets the water faster on one side than on the other; the drag's slope times this brakes the turn, which no model of
-the firmware includes. For a module that makes 0.20 N m per m/s and rad/s; tools/identify.py finds 0.14 to 0.21."""
+the firmware includes. For a module that makes 0.20 N m per m/s and rad/s; tools/identify.py finds 0.14 to 0.21. That is the mean over both
+directions of flow; how much more a long hull is braked by flow across it, `across` tells."""
 RESIDUAL, ACTED, DOWN_B, CORIOLIS, CROSSED, MUNK = slice(6), slice(6, 12), slice(12, 15), slice(15, 21), slice(21, 24), slice(24, 27)
 """Columns of a block, a row of means over its ticks: wrench residual, NaN unless the block is whole; wrench of the thrusters; down, body
 frame, at the block's end; Coriolis wrench; the two halves of FLOW."""
@@ -79,6 +80,7 @@ class MissingThrust:
         self._body, self.parameters = body, parameters
         self._plant = (body.mass, body.righting, body.drag.nodes, body.drag.rotational, body.drag.linear)
         self._columns = t.matrix.T.copy()
+        self._across = across(body)
         self._ticks = max(1, round(BLOCK_NS / period_ns))
         count = len(body.modules)
         gust = GUST_M_S * body.drag.cruise_slope
@@ -156,7 +158,7 @@ class MissingThrust:
         n, accels, speed = len(self._seen), 0, 0.0
         acceleration, model, coriolis, flow, forces = np.zeros(3), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(self._columns.shape[0])
         for nu, q_wb, force_n, accel in self._seen:  # in one batch, while the code is in the processor's cache
-            speed += add_tick(nu, q_wb, force_n, *self._plant, model, coriolis, flow, forces)
+            speed += add_tick(nu, q_wb, force_n, *self._plant, self._across, model, coriolis, flow, forces)
             if accel is not None:
                 accels += 1
                 add_motion(accel, q_wb, acceleration)
@@ -242,14 +244,25 @@ def add_coriolis(mass, nu, out):  # type: ignore[no-untyped-def]
     out += np.ascontiguousarray(mass[:, :3]) @ cross(nu[3:], nu[:3])
 
 
-@njit(f"void({V},{V})", cache=True)
-def add_flow(nu, out):  # type: ignore[no-untyped-def]
-    """Adds to `out` (6,) for each axis the speed across it times the rate about it, m/s rad/s, and the product of the other two velocities,
-    m^2/s^2: the additional (Munk) moment, N m, per kg of error in the difference of the masses along those two axes."""
-    across = abs(nu[0]) + abs(nu[1]) + abs(nu[2])
+def across(body: Body) -> np.ndarray:
+    """(3, 3) weights of flow along an axis (column) in what brakes a turn about another (row), mean 1: as the cube of the third extent."""
+    low, high = (body.r_bm - 0.5 * body.hull_m).min(axis=0), (body.r_bm + 0.5 * body.hull_m).max(axis=0)
+    cubes, weights = (high - low) ** 3, np.zeros((3, 3))
     for i in range(3):
-        out[i] += (across - abs(nu[i])) * nu[3 + i]
-        out[3 + i] += nu[(i + 1) % 3] * nu[(i + 2) % 3]
+        j, k = (i + 1) % 3, (i + 2) % 3
+        weights[i, [j, k]] = 2.0 * cubes[[k, j]] / (cubes[j] + cubes[k])
+    return weights
+
+
+@njit(f"void({V},{M},{V})", cache=True)
+def add_flow(nu, weights, out):  # type: ignore[no-untyped-def]
+    """Adds to `out` (6,) for each axis the weighted speed across it (`across`) times the rate about it, m/s rad/s, and the product of the
+    other two velocities, m^2/s^2: the additional (Munk) moment, N m, per kg of error in the difference of the masses along those two axes.
+    """
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        out[i] += (weights[i, j] * abs(nu[j]) + weights[i, k] * abs(nu[k])) * nu[3 + i]
+        out[3 + i] += nu[j] * nu[k]
 
 
 @njit(f"void({V},{V},{V})", cache=True)
@@ -260,12 +273,12 @@ def add_motion(accel, q_wb, out):  # type: ignore[no-untyped-def]
         out[i] += accel[i] + down[i]
 
 
-@njit(f"float64({V},{V},{V},{M},{V},{NODES},{V},{V},{V},{V},{V},{V})", cache=True)
-def add_tick(nu, q_wb, force_n, mass, righting, nodes, rotational, linear, model, coriolis, flow, forces):  # type: ignore[no-untyped-def]
+@njit(f"float64({V},{V},{V},{M},{V},{NODES},{V},{V},{M},{V},{V},{V},{V})", cache=True)
+def add_tick(nu, q_wb, force_n, mass, righting, nodes, rotational, linear, weights, model, coriolis, flow, forces):  # type: ignore[no-untyped-def]
     """Adds one tick to the sums of a block (the last four arguments) and returns the speed, m/s."""
     add_model(righting, nodes, rotational, linear, nu, q_wb, model)
     add_coriolis(mass, nu, coriolis)
-    add_flow(nu, flow)
+    add_flow(nu, weights, flow)
     forces += force_n
     return math.sqrt(nu[0] ** 2 + nu[1] ** 2 + nu[2] ** 2)
 

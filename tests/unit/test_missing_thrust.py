@@ -1,5 +1,7 @@
 """Lying thrusters are found by the thrust that the motion misses, and none is blamed for the effects of the water."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -15,6 +17,7 @@ from firmware_py.core.missing_thrust import (
     RESIDUAL,
     SPEED,
     MissingThrust,
+    across,
     add_coriolis,
     add_flow,
     add_model,
@@ -24,7 +27,7 @@ from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare.assembly import assemble_vehicle
+from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from tests.unit.robot_in_water import BODY, PUSH, TICK_NS, ZERO, Water
 
 
@@ -195,7 +198,7 @@ def test_a_thruster_is_not_blamed_for_what_the_water_does_to_a_body_that_turns_u
 
 def test_flow_is_what_a_turn_under_way_meets_and_every_block_has_it() -> None:
     nu, out, watch = np.array([0.3, -0.2, 0.1, 0.5, -0.4, 0.2]), np.zeros(6), MissingThrust(BODY, Faults(), TICK_NS)
-    add_flow(nu, out)
+    add_flow(nu, across(BODY), out)
     np.testing.assert_allclose(out, [0.3 * 0.5, -0.4 * 0.4, 0.5 * 0.2, -0.02, 0.03, -0.06])
     estimate = Estimate(
         np.array([0.0, 0.0, 2.0]), from_euler(0.0, 0.0, 0.0), nu, np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), 0, 1.0, 6, 0, True,
@@ -203,6 +206,34 @@ def test_flow_is_what_a_turn_under_way_meets_and_every_block_has_it() -> None:
     for _ in range(10):
         watch.step(Measured(nu[3:], np.zeros(3), None, []), estimate, np.zeros(8), np.ones(8, bool), True, True)
     np.testing.assert_allclose(watch._blocks[-1, FLOW], out)
+
+
+@pytest.mark.parametrize(("size_m", "blamed"), [((0.5, 0.5, 0.25), 3), ((0.6, 0.3, 0.25), -1)])
+def test_a_thruster_is_not_blamed_for_what_brakes_a_hull_that_turns_from_along_its_way_to_across(
+    size_m: tuple[float, float, float], blamed: int
+) -> None:
+    """The strips of a hull brake its turn by the cube of its extent across the flow. Regression: a healthy thruster of an ROV of 0.60 by
+    0.45 by 0.30 m that turned on a curve was left out for a second and a half."""
+    vehicle = load_vehicle("bluerov2")
+    body = assemble_vehicle(dataclasses.replace(vehicle, hull=dataclasses.replace(vehicle.hull, size_m=np.array(size_m))))
+    watch = MissingThrust(body, Faults(), TICK_NS)
+    watch._blocks[:], watch._blocks[:, SPEED] = 0.0, 0.45
+    for blocks, v_b in ((watch._blocks[:-RECENT], [0.45, 0.0, 0.0]), (watch._blocks[-RECENT:], [0.0, 0.45, 0.0])):
+        flow = np.zeros(6)
+        add_flow(np.r_[v_b, 0.0, 0.0, 0.5], across(body), flow)
+        blocks[:, FLOW] = flow
+    watch._blocks[-RECENT:, RESIDUAL] = -1.5 * body.thrusters.matrix[:, 3]
+    watch._blocks[-RECENT:, FORCES][:, 3] = 1.5
+    assert watch._explain(np.ones(6, bool)) == blamed
+
+
+def test_flow_along_both_axes_across_a_turn_counts_by_the_extent_that_it_meets() -> None:
+    vehicle = load_vehicle("modcube")
+    long = assemble_vehicle(dataclasses.replace(vehicle, hull=dataclasses.replace(vehicle.hull, size_m=np.array([0.4, 0.2, 0.2]))))
+    assert np.array_equal(across(BODY), 1.0 - np.eye(3))
+    np.testing.assert_allclose(across(long), [[0.0, 1.0, 1.0], [2 / 9, 0.0, 16 / 9], [2 / 9, 16 / 9, 0.0]])
+    pair = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [vehicle] * 2, [0, 1])
+    np.testing.assert_allclose(across(pair), across(long))
 
 
 @pytest.mark.parametrize("ready", [True, False])
