@@ -23,7 +23,7 @@ from pathlib import Path
 from command_line import Parser, refuse, run_tool
 
 from argument_types import check_results, folder_for_results
-from identify_excitation import MOTIONS, SPACE_M, check_space, excitation, is_seen_from_above, why_no_roll
+from identify_excitation import MOTIONS, SPACE_M, check_space, excitation, is_seen_from_above, pace_of, why_no_roll
 from identify_fit import Fit, Reference, fit
 from identify_log import Recording, read_recording
 from identify_model import Equations, Weight
@@ -36,6 +36,7 @@ from rich.table import Table
 from firmware_py.description.schema import DescriptionError, build, read_toml
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import ThrusterCurve, Vehicle, load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
 
 FARTHEST_M = 10.0
 """Largest distance from the hull's middle, as the vehicle file permits for its parts."""
@@ -115,7 +116,10 @@ def write_excitation(path: Path, motions: Sequence[str], vehicle: Vehicle, name:
         name: of the vehicle, or its file.
     """
     no_roll = why_no_roll(vehicle) if "turning" in motions else ""
-    path.write_text(excitation(motions, name, space_m, no_roll=no_roll, curve=vehicle.curve), encoding="utf-8")
+    pace = pace_of(assemble_vehicle(vehicle))
+    path.write_text(excitation(motions, name, space_m, no_roll=no_roll, curve=vehicle.curve, pace=pace), encoding="utf-8")
+    if pace < 1.0:
+        print(f"at {pace:.0%} of the usual pace, because {vehicle.name} is heavy for its thrusters")
     if not is_seen_from_above(vehicle):
         print(f"its camera looks down, and {vehicle.name} has no tag on top: put yours in its place, and leave out turns that hide the tag")
     if no_roll:

@@ -7,9 +7,11 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from firmware_py.core.body import Body
 from firmware_py.core.rotations import to_matrix
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import ThrusterCurve, Vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
 
 SPACE_M = (0.6, 0.5, 0.3)
 """Default travel to either side of the middle: keeps the peaks below 0.45 m/s and 0.35 m/s^2."""
@@ -21,6 +23,10 @@ YAW_TURNS, ROLL_TURNS = 0.81, 0.57
 """Turns per round: each peaks at half a rad/s; in slower turning the damping hides the inertia."""
 SEEN_DEG, LOOKS = 60.0, 72
 """Incidence up to which a tag counts as seen, less than the 65 deg at which a reading ends; and roll angles that are looked at."""
+LARGEST_M_S2 = 0.35
+"""Peak acceleration with SPACE_M at RATE_HZ."""
+SHARE = 0.35
+"""Share of what the thrusters can give, force or moment of roll, that the flight may take; drag, current and other axes need the rest."""
 DEADBANDS = (0.10 / 0.17, 0.25 / 0.17)
 """Least and largest deadband of the bench's thrusters, over that of the vehicle file: those of the bench, for a module's 0.17 N."""
 MOTIONS: Mapping[str, tuple[tuple[int, ...], bool]] = {
@@ -95,10 +101,18 @@ def is_seen_from_above(vehicle: Vehicle) -> bool:
     return any(to_matrix(tag.quaternion.copy())[2, 2] >= math.cos(math.radians(SEEN_DEG)) for tag in vehicle.tag)
 
 
+def pace_of(body: Body) -> float:
+    """The pace, at most 1, at which a body's thrusters can make the motion: one that they saturate in tells wrong numbers."""
+    return min(1.0, math.sqrt(SHARE * float(body.deceleration[0]) / LARGEST_M_S2))
+
+
 def why_no_roll(vehicle: Vehicle) -> str:
     """Why a vehicle cannot roll full turns below the camera, in words; empty where it can."""
     if "roll" in vehicle.passive_dof:
         return "its roll is left to buoyancy"
+    body = assemble_vehicle(vehicle)
+    if np.linalg.norm(body.righting) > SHARE * body.thrusters.full_wrench[3]:
+        return "its thrusters are too weak against its righting moment"
     outward = np.array([-to_matrix(tag.quaternion.copy())[:, 2] for tag in vehicle.tag])
     angle = np.linspace(0.0, 2.0 * np.pi, LOOKS, endpoint=False)
     up = np.stack([np.zeros(LOOKS), np.sin(angle), -np.cos(angle)])
@@ -113,6 +127,7 @@ def excitation(
     duration_s: float = 170.0,
     no_roll: str = "",
     curve: ThrusterCurve | None = None,
+    pace: float = 1.0,
 ) -> str:
     """TOML text of a scenario that makes the `motions` (keys of MOTIONS). Raises DescriptionError where one has no room.
 
@@ -120,6 +135,7 @@ def excitation(
         vehicle: name or file. space_m: (3,) how far the vehicle may go to either side of the middle, along each world axis.
         no_roll: why the vehicle turns about the vertical alone, if so.
         curve: of the vehicle's thrusters, whose lag and deadband the bench's then have; None: the bench's own.
+        pace: share of the usual speed, by `pace_of`.
     """
     check_space(space_m)
     axes = {axis for motion in motions for axis in MOTIONS[motion][0]}
@@ -128,7 +144,7 @@ def excitation(
     if narrow := ", ".join("xyz"[i] for i in sorted(axes) if amplitude[i] == 0.0):
         raise DescriptionError(f"--space {_words(space_m)} leaves no room along {narrow}; give what is free to either side, m")
     reach = np.array([a / full for a, full in zip(amplitude, SPACE_M, strict=True) if a > 0.0])
-    rounds = RATE_HZ * duration_s / math.sqrt(reach.max() if reach.size else 1.0)
+    rounds = pace * RATE_HZ * duration_s / math.sqrt(reach.max() if reach.size else 1.0)
     text = TEMPLATE.format(
         why=", ".join(motion for motion in MOTIONS if motion in motions),
         vehicle=vehicle,

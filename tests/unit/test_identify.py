@@ -130,6 +130,23 @@ def test_excitation_is_flown_with_thrusters_as_the_vehicle_has_them() -> None:
     assert worlds[2] == {"thruster_lag_s": 0.05, "deadband_low_n": 0.02, "deadband_high_n": 0.05}
 
 
+@pytest.mark.parametrize(("arm_m", "rolls"), [(0.012, True), (0.015, False)])
+def test_vehicle_rolls_only_where_its_thrusters_can_turn_it_over(arm_m: float, rolls: bool) -> None:
+    """An ROV whose righting moment was nine tenths of its roll moment was 60 deg off, and its mass 8 % with an interval of 3 %."""
+    whole = load_vehicle("modcube")
+    stiff = dataclasses.replace(whole, inertial=dataclasses.replace(whole.inertial, righting_arm_m=arm_m))
+    assert ("righting moment" not in excitation.why_no_roll(stiff)) is rolls
+
+
+def test_heavy_vehicle_is_shaken_as_its_thrusters_can() -> None:
+    """One of 0.2 m/s^2 saturated for three minutes, and the mass that was identified was twice its own."""
+    whole = load_vehicle("modcube")
+    heavy = dataclasses.replace(whole, inertial=dataclasses.replace(whole.inertial, dry_kg=130.0))
+    paces = [excitation.pace_of(assemble_vehicle(vehicle)) for vehicle in (whole, heavy)]
+    assert paces == [1.0, pytest.approx((25.46 / 142.9) ** 0.5, rel=1e-3)]
+    assert f"turns = {9.0 * paces[1]:.2f}" in excitation.excitation(["turning"], "modcube", pace=paces[1])
+
+
 @pytest.mark.parametrize(("face", "said"), [(0, True), (5, False)])
 def test_excitation_of_a_vehicle_without_a_tag_on_top_says_whose_camera_is_wanted(
     face: int, said: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
