@@ -54,10 +54,12 @@ class Estimation:
         "full", choices=("full", "paper"), help="full: tags, IMU and depth, with disturbance estimate; paper: tags alone"
     )
     tag_sigma_m: float = quantity(
-        0.0021, unit="m", low=1e-5, high=1, help="tag position noise across the camera axis", mavlink="TAG_POS_SD"
+        0.0021, unit="m", low=1e-5, high=1,
+        help="horizontal tag position noise: across the axis of a camera that looks down", mavlink="TAG_POS_SD"
     )
     tag_sigma_axis_m: float = quantity(
-        0.0042, unit="m", low=1e-5, high=1, help="tag position noise along the camera axis", mavlink="TAG_AXIS_SD"
+        0.0042, unit="m", low=1e-5, high=1,
+        help="vertical tag position noise: along the axis of a camera that looks down", mavlink="TAG_AXIS_SD"
     )
     tag_sigma_rad: float = quantity(
         0.0096, unit="rad", low=1e-5, high=1, help="tag attitude noise, each axis", mavlink="TAG_ATT_SD"
