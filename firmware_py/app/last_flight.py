@@ -20,6 +20,7 @@ from firmware_py.core.types import Mode
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.signals import read_attachment
 from firmware_py.runtime.flight_log import LoggedFrame, frame_of
+from firmware_py.runtime.guarded_file import DATED_BACK_NS
 from firmware_py.runtime.log_end import last_bodies
 from firmware_py.runtime.log_folder import log_folders
 from firmware_py.runtime.recorder import CAN_LOG, CONFIGURATION, SIGNAL_LOG
@@ -101,17 +102,18 @@ def outdate(out: Path, now_ns: int) -> None:
     for folder in log_folders(out):
         with suppress(OSError):
             if _is_recent((folder / CAN_LOG).stat(), now_ns):
-                os.utime(folder / CAN_LOG, ns=(0, 0))
+                os.utime(folder / CAN_LOG, ns=(DATED_BACK_NS, DATED_BACK_NS))
 
 
 def _is_recent(status: os.stat_result, now_ns: int) -> bool:
-    return 0 <= now_ns - status.st_mtime_ns < RECENT_NS
+    """Whether a log was written lately and not dated back; just after a start in 1970 its age does not tell the two apart."""
+    return status.st_mtime_ns != DATED_BACK_NS and 0 <= now_ns - status.st_mtime_ns < RECENT_NS
 
 
 def _is_dated_back(path: Path) -> bool:
     """Whether a log file was ended before its flight by an error (runtime.guarded_file), although the other may go on to its end."""
     try:
-        return path.stat().st_mtime_ns == 0
+        return path.stat().st_mtime_ns == DATED_BACK_NS
     except OSError:
         return False
 

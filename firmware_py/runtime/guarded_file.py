@@ -14,6 +14,8 @@ from queue import SimpleQueue
 
 MOST_WAITING_BYTES = 8_000_000
 """A minute and a half of one module's log at 100 Hz; a longer backlog ends the log."""
+DATED_BACK_NS = 0
+"""Modification time, Unix, of a log that was ended before its flight."""
 CLOSE_S = 5.0
 """How long the end of a run waits for a disk."""
 
@@ -80,7 +82,7 @@ class GuardedFile:
     def _date_back(self) -> None:
         if self._file is not None:
             with suppress(OSError):
-                os.utime(self._file.fileno(), ns=(0, 0))
+                os.utime(self._file.fileno(), ns=(DATED_BACK_NS, DATED_BACK_NS))
 
     def close(self) -> None:
         """Close; a second call does nothing."""

@@ -78,6 +78,14 @@ def test_log_that_is_old_or_of_another_clock_says_nothing(tmp_path: Path, age_ns
     assert len(in_flight(tmp_path, WRITTEN_NS + age_ns)) == found
 
 
+def test_log_that_a_failed_disk_ended_says_nothing_by_a_clock_that_starts_in_1970(tmp_path: Path) -> None:
+    """A Jetson without a battery for its clock: half a minute after its start, such a log's date is half a minute ago."""
+    write(tmp_path, lines_of([True] * 3), 0)
+    assert in_flight(tmp_path, 30_000_000_000) == set()
+    write(tmp_path, lines_of([True] * 3), 1_000_000_000)
+    assert in_flight(tmp_path, 30_000_000_000) == {0, 1, 2}
+
+
 def test_newest_log_counts(tmp_path: Path) -> None:
     write(tmp_path, lines_of([True] * 3))
     write(tmp_path / "0002", lines_of([False] * 3))
