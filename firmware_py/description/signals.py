@@ -5,12 +5,12 @@ A channel is an MCAP topic with one protobuf message per tick. Firmware and benc
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cached_property
-from io import BytesIO
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
@@ -170,7 +170,9 @@ def read_messages(path: Path) -> Iterator[LogMessage]:
 
 def is_closed(path: Path) -> bool:
     """Whether an MCAP log was written to its end. Raises OSError."""
-    return path.read_bytes().endswith(MCAP_MAGIC)
+    with path.open("rb") as file:
+        file.seek(-min(len(MCAP_MAGIC), os.fstat(file.fileno()).st_size), os.SEEK_END)
+        return file.read() == MCAP_MAGIC
 
 
 def read_attachment(path: Path, name: str) -> bytes | None:
@@ -209,12 +211,18 @@ def read_signals(path: Path) -> dict[str, Columns]:
 
 def log_records(path: Path) -> Iterator[Any]:
     """The records of an MCAP log (mcap.records), up to its end or to the point of truncation. Raises OSError."""
-    yield from _records_of(BytesIO(path.read_bytes()))
+    with path.open("rb") as file:
+        yield from _records_of(file)
 
 
-def _records_of(log: IO[bytes]) -> Iterator[Any]:
+def open_reader(log: BinaryIO) -> StreamReader:
+    """A reader of an open log. A record longer than the whole log spoils it; nothing is allocated for it."""
+    return StreamReader(log, validate_crcs=True, record_size_limit=os.fstat(log.fileno()).st_size)
+
+
+def _records_of(log: BinaryIO) -> Iterator[Any]:
     try:
-        yield from StreamReader(log, validate_crcs=True).records
+        yield from open_reader(log).records
     except SPOILT:
         return  # truncated: the records before stay valid
 

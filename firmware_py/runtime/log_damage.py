@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import re
-from io import BytesIO
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 
-from mcap.stream_reader import StreamReader
-
-from firmware_py.description.signals import MCAP_MAGIC, SPOILT, read_messages
+from firmware_py.description.signals import SPOILT, is_closed, open_reader, read_messages
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG
 from firmware_py.runtime.tick_messages import TICKS
 
+_PIECE_BYTES = 1 << 16
 _STAMP = re.compile(r"\(\d+\.\d{6}\)")
 
 
@@ -25,13 +24,14 @@ def damaged_at(path: Path) -> int | None:
     """Byte of the first record of a signal log that cannot be read although more data follows; None for a log that is whole or only ends
     too early. Zeros do not count as data: a file system leaves them behind a power loss. Raises OSError.
     """
-    data = path.read_bytes()
-    log, good = BytesIO(data), 0
-    try:
-        for _ in StreamReader(log, validate_crcs=True).records:
-            good = log.tell()
-    except SPOILT:
-        return good if data.endswith(MCAP_MAGIC) or data[log.tell() :].strip(b"\0") else None
+    good = 0
+    with path.open("rb") as log:
+        try:
+            for _ in open_reader(log).records:
+                good = log.tell()
+        except SPOILT:
+            rest = iter(partial(log.read, _PIECE_BYTES), b"")
+            return good if is_closed(path) or any(piece.strip(b"\0") for piece in rest) else None
     return None
 
 

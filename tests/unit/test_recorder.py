@@ -1,12 +1,15 @@
 """The recorder's files: readable by third-party tools, identical for identical runs, and intact up to a tear."""
 
 import errno
+import tracemalloc
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import can
 import numpy as np
 import pytest
+from mcap.opcode import Opcode
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
@@ -23,7 +26,8 @@ from firmware_py.core.types import (
     Setpoint,
     Thrust,
 )
-from firmware_py.description.signals import Layout, Signal, read_signals
+from firmware_py.description.signals import MCAP_MAGIC, Layout, Signal, is_closed, read_messages, read_signals
+from firmware_py.runtime.log_damage import damaged_at
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, GuardedFile, Recorder
 from hil.plant.world import BodyTruth, Truth
 from hil.signals import read_flight
@@ -150,6 +154,29 @@ def test_flushed_log_loses_nothing_when_the_process_is_killed(tmp_path: Path) ->
     record_ticks(tmp_path, ticks=100, killed=True)
     assert len(read_signals(tmp_path / SIGNAL_LOG)["/firmware/body0"]["tick"]) == 100
     assert len((tmp_path / CAN_LOG).read_text().splitlines()) == 400
+
+
+@pytest.mark.parametrize("read", [is_closed, damaged_at, lambda path: sum(1 for _ in read_messages(path))])
+def test_long_signal_log_is_read_without_being_held_in_memory(read: Callable[[Path], object], tmp_path: Path) -> None:
+    """A day of one module is 7 GB."""
+    record_ticks(tmp_path, 2000, killed=True)
+    read(tmp_path / SIGNAL_LOG)  # imports of the first call
+    tracemalloc.start()
+    read(tmp_path / SIGNAL_LOG)
+    held = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert held < (tmp_path / SIGNAL_LOG).stat().st_size / 4
+
+
+def test_record_longer_than_its_log_takes_no_memory(tmp_path: Path) -> None:
+    record_ticks(tmp_path)
+    whole = (tmp_path / SIGNAL_LOG).read_bytes()
+    (tmp_path / SIGNAL_LOG).write_bytes(MCAP_MAGIC + bytes([Opcode.CHUNK]) + (1 << 31).to_bytes(8, "little") + whole)
+    tracemalloc.start()
+    assert list(read_messages(tmp_path / SIGNAL_LOG)) == []
+    held = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert held < 1 << 20
 
 
 def test_full_disk_ends_the_log_with_one_warning_and_no_exception(
