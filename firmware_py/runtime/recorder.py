@@ -104,24 +104,31 @@ class Recorder:
         self._reported = False
         self._closed = False
         self._context = context if context is not None else foxglove.Context()
-        options = MCAPWriteOptions(compression=None, disable_seeking=True, profile="")
-        self._writer = foxglove.open_mcap(
-            self._mcap,
-            context=self._context,
-            writer_options=options,
-            channel_filter=lambda channel: channel.topic not in LIVE_ONLY,
-        )
-        if configuration is not None:
-            data = json.dumps(configuration, sort_keys=True).encode()
-            self._writer.attach(
-                log_time=0, create_time=0, name=CONFIGURATION, media_type="application/json", data=data
-            )
+        self._writer = self._open_writer(configuration) if folder is not None else None
+        """Keeps an index of all that it writes, 40 MB a day and module: closed once nothing reaches the file any more."""
         self._messages = messages = TickMessages()
         self._times = Layout("Times", TIMES_SIGNALS)
         self._buses: dict[int, Layout] = {}
         self._channels: dict[str, foxglove.Channel] = {}
         for topic, layout in ((TICKS, messages.ticks), (REQUESTS, messages.requests), (EVENTS, messages.events)):
             self._channel(topic, layout)
+
+    def _open_writer(self, configuration: Mapping[str, Any] | None) -> foxglove.MCAPWriter:
+        writer = foxglove.open_mcap(
+            self._mcap,
+            context=self._context,
+            writer_options=MCAPWriteOptions(compression=None, disable_seeking=True, profile=""),
+            channel_filter=lambda channel: channel.topic not in LIVE_ONLY,
+        )
+        if configuration is not None:
+            data = json.dumps(configuration, sort_keys=True).encode()
+            writer.attach(log_time=0, create_time=0, name=CONFIGURATION, media_type="application/json", data=data)
+        return writer
+
+    def _close_writer(self) -> None:
+        writer, self._writer = self._writer, None
+        if writer is not None:
+            writer.close()
 
     def _channel(self, topic: str, layout: Layout | TextLayout) -> foxglove.Channel:
         found = self._channels.get(topic)
@@ -189,7 +196,10 @@ class Recorder:
         self._make()
         self._can.write("".join(self._lines).encode())
         self._lines.clear()
-        self._writer.flush()
+        if self._mcap.error is not None:
+            self._close_writer()
+        elif self._writer is not None:
+            self._writer.flush()
         for file in (self._can, self._mcap) if to_disk else ():
             file.sync()
         return self._failure()
@@ -222,7 +232,7 @@ class Recorder:
             return []
         self._closed = True
         events = self.flush()
-        self._writer.close()
+        self._close_writer()
         self._can.close()
         self._mcap.close()
         return events or self._failure()

@@ -204,6 +204,24 @@ def test_folder_that_is_missing_gives_a_warning_and_no_exception(tmp_path: Path)
     assert [event.text for event in recorder.close()] == ["no more log: can.log: No such file or directory"]
 
 
+@pytest.mark.parametrize("folder", ["missing", None])
+def test_signals_that_no_file_takes_leave_nothing_behind(
+    folder: str | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The writer of signals.mcap keeps an index, 40 MB a day: after a failed disk, or for viewers alone, it grew without end."""
+    kept: list[int] = []
+    write = GuardedFile.write
+    monkeypatch.setattr(GuardedFile, "write", lambda file, data: kept.append(file is recorder._mcap) or write(file, data))
+    recorder = Recorder(folder and tmp_path / folder)
+    recorder.flush()
+    kept.clear()
+    for tick in range(20):
+        recorder.record(Inputs(tick, tick * PERIOD_NS, []), Outputs(tick, tick * PERIOD_NS, [], False, [], []))
+        recorder.flush()
+    recorder.close()
+    assert not any(kept)
+
+
 def test_body_that_grew_keeps_its_channel(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     recorder = Recorder(tmp_path)
