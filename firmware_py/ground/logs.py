@@ -15,6 +15,8 @@ _PIECES_AT_ONCE = 20
 _ENTRIES_AT_ONCE = 10
 """Entries of a list sent per round: half as many frames as pieces, since each requires a look at its file."""
 _MOST_LOGS = 100
+_MOST_BYTES = 2**32 - 1
+"""Most of a log that the protocol can address, the size that it gives for a longer one: 14 hours of one module's signals.mcap."""
 _SUFFIXES = (".mcap", ".log")
 
 
@@ -76,7 +78,7 @@ class LogService:
         try:
             with t.path.open("rb") as file:
                 file.seek(t.at)
-                data = file.read(min(t.left, _PIECE * _PIECES_AT_ONCE))
+                data = file.read(min(t.left, _PIECE * _PIECES_AT_ONCE, _MOST_BYTES - t.at))
         except OSError:
             data = b""
         for start in range(0, len(data), _PIECE):

@@ -136,6 +136,21 @@ def test_logs_are_listed_and_fetched(identity: str, first: int, tmp_path: Path) 
     assert "logs are not erased" in client.texts and (tmp_path / "can.log").exists()
 
 
+def test_log_beyond_what_the_protocol_can_address_ends_there(tmp_path: Path) -> None:
+    """A day of one module is 7 GB. Regression: what lies behind 4 GiB came as pieces of one and the same place."""
+    (tmp_path / "signals.mcap").touch()
+    os.truncate(tmp_path / "signals.mcap", 2**32 + 1000)  # takes no room on the disk
+    world = World(config=GroundConfig(logs=str(tmp_path)))
+    client = world.client()
+    client.send("LOG_REQUEST_LIST", 1, 1, 0, 0xFFFF)
+    client.send("LOG_REQUEST_DATA", 1, 1, 0, 2**32 - 200, 0xFFFFFFFF)
+    world.run(20)
+    assert client.last("LOG_ENTRY").size == 2**32 - 1
+    assert [(piece.ofs, piece.count) for piece in client.all("LOG_DATA")] == [
+        (2**32 - 200, 90), (2**32 - 110, 90), (2**32 - 20, 19), (2**32 - 1, 0),
+    ]  # fmt: skip
+
+
 def test_logs_of_all_runs_are_listed_oldest_first_whatever_their_times(tmp_path: Path) -> None:
     """The first run logs into the folder itself, later ones into numbered folders in it. The clock may be set back."""
     for size, name in enumerate((".", "0002", "0003", "0010", "9999", "10000"), 1):
