@@ -78,7 +78,9 @@ def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
 
 
 def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
-    """State of `body`, which was a piece of `whole`. The disturbance is shared out by mass."""
+    """State of `body`, which was a piece of `whole`. The disturbance is shared out by mass, righting by its variance: a part of it was the
+    lever of the pieces' lifts, which no piece has alone. Shared out by mass, it grew with every dock.
+    """
     x = motion.x.copy()
     x[Nominal.ATTITUDE] = _attitude(whole, motion.x, body)
     x[Nominal.POSITION] = _position(whole, motion.x, body, x[Nominal.ATTITUDE])
@@ -87,7 +89,7 @@ def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
     share = body.rigid_mass_kg / whole.rigid_mass_kg
     x[Nominal.FORCE] = motion.x[Nominal.FORCE] * share
     x[Nominal.MOMENT] = turn @ motion.x[Nominal.MOMENT] * share
-    x[Nominal.RIGHTING] = turn @ motion.x[Nominal.RIGHTING] * share
+    x[Nominal.RIGHTING] = turn @ motion.x[Nominal.RIGHTING] * body.righting_sigma**2 / (np.square(turn) @ whole.righting_sigma**2)
     biases = _biases(whole, motion.x, body)
     x[Nominal.GYRO_BIAS], x[Nominal.ACCEL_BIAS] = biases[:3], biases[3:]
     x[Nominal.DOWN] = down_of(x)
