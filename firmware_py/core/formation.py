@@ -11,7 +11,7 @@ from firmware_py.core.docking import DockingStage
 from firmware_py.core.docking_decisions import Decisions, Join, Part
 from firmware_py.core.docking_pairs import APART, LOOSE
 from firmware_py.core.joints import modules_of
-from firmware_py.core.topology import in_both, join, part_of
+from firmware_py.core.topology import attitude_of, in_both, join, part_of
 from firmware_py.core.types import WARNING, DockRequest, Estimate, Event, Inputs, Mode, Outputs, PartRequest
 from firmware_py.description.parameters import Parameters
 
@@ -210,7 +210,9 @@ def take_over(pipeline: BodyPipeline, before: Sequence[BodyPipeline], time_ns: i
     pipeline.supervisor.take_over([other.supervisor for other in before])
     estimate = pipeline.estimator.restart(time_ns, motion)
     namesake = next((other.guidance for other in before if other.body.index == pipeline.body.index), None)
-    pipeline.guidance.take_over(pipeline.supervisor.mode, estimate, pipeline.body.thrusters.matrix @ pipeline.limiter.force_n, namesake)
+    q_wb = attitude_of(pipeline.body, before[0].body, before[0].guidance.held_q_wb)
+    wrench = pipeline.body.thrusters.matrix @ pipeline.limiter.force_n
+    pipeline.guidance.take_over(pipeline.supervisor.mode, estimate, wrench, q_wb, namesake)
     return estimate
 
 

@@ -162,12 +162,17 @@ class Guidance:
         self._trajectory = self._goal = self._docking = None
         self._wrench, self._blend = np.zeros(6), True
 
-    def take_over(self, mode: Mode, estimate: Estimate, wrench: np.ndarray, before: Guidance | None = None) -> None:
-        """Starts in `mode` at the pose of a new body, from the wrench (6,) that its thrusters give. `before`, the guidance of the body that
-        had its number, hands over its stick input, so that the pilot keeps control.
+    def take_over(
+        self, mode: Mode, estimate: Estimate, wrench: np.ndarray, q_wb: np.ndarray, before: Guidance | None = None
+    ) -> None:
+        """Starts in `mode` at the pose of a new body, from the wrench (6,) that its thrusters give, and turns back to `q_wb`, the attitude
+        that the previous body was to hold, if that is near: otherwise bodies that dock and part again and again would lean over. `before`,
+        the guidance of the body that had its number, hands over its stick input, so that the pilot keeps control.
         """
         self._glider.put(at_estimate(estimate))
         self.mode, self._wrench, self._blend = mode, wrench, True
+        if np.linalg.norm(difference(q_wb, estimate.q_wb)) <= NEAR_RAD:
+            self._goal = Wish(ZERO, ZERO, self._glider.at.p_wb + self._glider.at.v_w * (2.0 / self._p.bandwidth), q_wb)
         if before is not None:
             self._sticks, self._sticks_ns = before._sticks, before._sticks_ns
 
@@ -197,6 +202,12 @@ class Guidance:
         """Returns to the position held before meeting another body, unless the body has been sent or steered elsewhere since."""
         if self._met is not None and self._goal is self._met[1]:
             self._goal = self._met[0]
+
+    @property
+    def held_q_wb(self) -> np.ndarray:
+        """(4,) attitude of the set-point, or the one that it is on its way to."""
+        q_wb = self._held().q_wb
+        return self._glider.at.q_wb if q_wb is None else q_wb
 
     def _held(self) -> Wish:
         """POSHOLD's position, or the one that it is on its way to."""

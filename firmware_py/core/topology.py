@@ -55,7 +55,7 @@ def join(parts: Sequence[tuple[Body, Motion]], body: Body) -> Motion:
     """State of `body`, made of the bodies `parts`; its first module is one of the first part."""
     x = np.zeros(STATES)
     first, motion = parts[0]
-    x[Nominal.ATTITUDE] = _attitude(first, motion.x, body)
+    x[Nominal.ATTITUDE] = attitude_of(body, first, motion.x[Nominal.ATTITUDE].copy())
     x[Nominal.POSITION] = _position(first, motion.x, body, x[Nominal.ATTITUDE])
     momentum, force, moment, off = np.zeros(6), np.zeros(3), np.zeros(3), np.zeros(3)
     for part, moved in parts:
@@ -82,7 +82,7 @@ def part_of(whole: Body, motion: Motion, body: Body) -> Motion:
     lever of the pieces' lifts, which no piece has alone. Shared out by mass, it grew with every dock.
     """
     x = motion.x.copy()
-    x[Nominal.ATTITUDE] = _attitude(whole, motion.x, body)
+    x[Nominal.ATTITUDE] = attitude_of(body, whole, motion.x[Nominal.ATTITUDE].copy())
     x[Nominal.POSITION] = _position(whole, motion.x, body, x[Nominal.ATTITUDE])
     lever_b, turn = _place(body, whole)
     x[Nominal.NU] = _transport(lever_b, turn) @ motion.x[Nominal.NU]
@@ -121,11 +121,11 @@ def _transport(lever_b: np.ndarray, turn: np.ndarray) -> np.ndarray:
     return h
 
 
-def _attitude(old: Body, x: np.ndarray, new: Body) -> np.ndarray:
-    """(4,) attitude of `new` from that of `old`, by a module that both contain."""
+def attitude_of(new: Body, old: Body, q_wb: np.ndarray) -> np.ndarray:
+    """(4,) attitude of `new` where that of `old` is `q_wb` (4,), by a module that both contain."""
     i, j = in_both(old.modules, new.modules)[0]
     turn = multiply(np.ascontiguousarray(old.q_bm[i]), conjugate(np.ascontiguousarray(new.q_bm[j])))
-    return np.asarray(normalise(multiply(x[Nominal.ATTITUDE].copy(), turn)))
+    return np.asarray(normalise(multiply(q_wb, turn)))
 
 
 def _position(old: Body, x: np.ndarray, new: Body, q_new: np.ndarray) -> np.ndarray:

@@ -93,7 +93,7 @@ def test_body_that_takes_over_goes_on_at_its_speed_and_from_its_thrusters_wrench
     flight, before = Flight(), np.array([4.0, -1.0, 2.0, 0.5, 0.4, -0.3])
     turned = from_euler(0.0, 0.0, 0.5 * math.pi)
     moving = estimate((0.5, 0.5, 1.0), turned, (0.2, 0.0, 0.0, 0.0, 0.0, 0.1))
-    flight.guidance.take_over(Mode.POSHOLD, moving, before)
+    flight.guidance.take_over(Mode.POSHOLD, moving, before, turned)
     flight.estimate = moving
     now = flight.run(0.01, follows=False)
     np.testing.assert_allclose(now.p_wb, moving.p_wb, atol=1e-6)
@@ -103,6 +103,18 @@ def test_body_that_takes_over_goes_on_at_its_speed_and_from_its_thrusters_wrench
     np.testing.assert_allclose(flight.wrenches[-1], 0.5 * (before + WRENCH), atol=1e-9)
     flight.run(0.5 * Parameters().steering.blend_s, follows=False)
     np.testing.assert_allclose(flight.wrenches[-1], WRENCH, atol=1e-9)
+
+
+@pytest.mark.parametrize(("lean", "kept"), [(0.3, True), (0.4, False)])
+def test_body_that_takes_over_turns_back_to_the_attitude_that_was_to_be_held_if_that_is_near(lean: float, kept: bool) -> None:
+    flight, leaning = Flight(), from_euler(0.0, lean, 0.0)
+    flight.estimate = estimate((0.5, 0.5, 1.0), leaning, (0.2, 0.0, 0.0, 0.0, 0.0, 0.0))
+    flight.guidance.take_over(Mode.POSHOLD, flight.estimate, WRENCH, LEVEL)
+    assert flight.run(0.01, follows=False).q_wb == pytest.approx(leaning, abs=1e-4), "without a jump"
+    now = flight.run(5.0)
+    assert np.linalg.norm(difference(now.q_wb, LEVEL if kept else leaning)) < 1e-3
+    went_m = 2.0 / Parameters().steering.bandwidth * 0.2
+    assert now.p_wb == pytest.approx([0.5 + went_m * math.cos(lean), 0.5, 1.0 - went_m * math.sin(lean)], abs=2e-3), "as far as it brakes"
 
 
 def test_second_dock_begins_without_the_wish_of_the_first() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_py.core.docking_decisions import Decisions, Join
-from firmware_py.core.rotations import rotate
+from firmware_py.core.rotations import difference, rotate
 from firmware_py.core.transitions import State
 from firmware_py.core.types import RELAY_PUSH, Action, DockRequest, Mode, ModuleInputs, Request
 from firmware_py.core.undocking import IN_PLACE, PULLED
@@ -29,6 +29,21 @@ def test_undock_ends_with_its_mode_and_the_joint_holds(stop: str) -> None:
     assert tank.shape == [(0, 1)] and tank.when("undock of module 1 ended")
     assert [max(states) for states in tank.pipeline.formation.docking.relays.states] == [1, 1], "and pull again"
     assert outputs.records[0].mode == Mode.POSHOLD
+
+
+def test_pieces_of_an_undock_hold_the_attitude_that_the_body_was_to_hold() -> None:
+    """Regression: each held the attitude that it had then. After six docks and undocks a module leant over by ten degrees."""
+    tank = FaultyTank(RING[:2])
+    tank.fly()
+    tank.run(1.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
+    held = tank.outputs[-1].records[0].setpoint.q_wb
+    tank.states[0][11] += 0.5  # something turns it meanwhile, rad/s
+    while len(tank.shape) == 1:
+        outputs = tank.run(0.01)
+    for record in outputs.records:
+        assert np.linalg.norm(difference(record.estimate.q_wb, held)) > 0.01
+    for record in tank.run(8.0).records:
+        assert record.setpoint.q_wb == pytest.approx(held, abs=1e-3)
 
 
 def test_second_of_two_undocks_of_one_body_in_one_tick_is_ended_and_its_joint_holds() -> None:
