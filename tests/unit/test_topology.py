@@ -225,8 +225,8 @@ def test_righting_of_a_pair_goes_to_its_halves_as_far_as_it_is_theirs(two: tuple
 
 def test_righting_does_not_grow_with_docks_and_undocks() -> None:
     """Of two level modules one lifts and one sinks, by half a newton each. Regression: every dock added a tenth of its lever to both."""
-    plan = plan_dock(DockRequest(1, 1, 0, 0), *(assemble([(0, 0, 0)], [0], [VEHICLES[0]], [m]) for m in (1, 0)), VEHICLES[:1] * 2)
-    merged = plan.merged
+    active, target = (assemble([(0, 0, 0)], [0], VEHICLES[:1], [module]) for module in (1, 0))
+    merged = plan_dock(DockRequest(1, 1, 0, 0), active, target, VEHICLES[:1] * 2).merged
     parted = plan_undock(DockRequest(1, 1, 0, 0), merged, VEHICLES[:1] * 2)
     states = [np.zeros(STATES), np.zeros(STATES)]
     for _ in range(50):
