@@ -119,7 +119,11 @@ def _plan(
     request = _Request.of(waypoints if len(waypoints) > 1 else [*waypoints, *waypoints], limits, body, wanted)
     base = request.durations(durations_s)
     if durations_s is not None and not stretch:
-        return request.attempt(base)
+        try:
+            return request.attempt(base)
+        except InfeasibleError:
+            request.check_standing()  # where that is the reason, more time would not help
+            raise
     request.check_standing()
     if durations_s is None:
         check_bounded(waypoints, limits, body)

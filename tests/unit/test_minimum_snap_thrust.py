@@ -100,12 +100,14 @@ def test_free_durations_are_as_short_as_the_thrusters_allow(one: Body) -> None:
     assert plan(poses(4), None, body=half).duration_s > 1.2 * found.duration_s
 
 
-def test_attitude_that_cannot_be_held_is_refused_at_once() -> None:
+@pytest.mark.parametrize("stretch", [True, False])
+def test_attitude_that_cannot_be_held_is_refused_at_once(stretch: bool) -> None:
+    """Also where the durations are not to be stretched: there it was refused for the way to it, as if more time would help."""
     vehicle = load_vehicle("modcube")
     heavy = dataclasses.replace(vehicle, inertial=dataclasses.replace(vehicle.inertial, righting_arm_m=0.1))
     waypoints = [Waypoint(np.zeros(3)), Waypoint(np.array([1.0, 0, 0]), rotations.from_euler(math.pi / 2, 0.0, 0.0))]
     with pytest.raises(InfeasibleError, match="to stand still at waypoint 1") as refused:
-        plan(waypoints, [10.0], body=assemble_vehicle(heavy))
+        plan(waypoints, [10.0], body=assemble_vehicle(heavy), stretch=stretch)
     assert refused.value.place == (1, None)
 
 
