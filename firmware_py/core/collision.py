@@ -15,6 +15,7 @@ from numba import njit
 
 from firmware_py.core.body import Body
 from firmware_py.core.rotations import M, V, cross, rotate
+from firmware_py.core.setpoint import way_to_rest_s
 from firmware_py.core.types import Estimate
 
 CLOSING_M_S, OWN_M_S = 0.08, 0.04
@@ -33,7 +34,7 @@ def braking_s(speed: np.ndarray, deceleration: np.ndarray, bandwidth: float) -> 
         deceleration: (..., 2) as Body.deceleration.
         bandwidth: of the filter, rad/s.
     """
-    return np.asarray(2.0 / bandwidth + 0.5 * np.max(speed / deceleration, axis=-1))
+    return np.asarray(way_to_rest_s(bandwidth) + 0.5 * np.max(speed / deceleration, axis=-1))
 
 
 def times_to_brake(

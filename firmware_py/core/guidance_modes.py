@@ -17,7 +17,7 @@ from firmware_py.core.collision import braking_s
 from firmware_py.core.failsafes import FREE, Level
 from firmware_py.core.health import Health
 from firmware_py.core.rotations import difference, heading, rotate, rotate_back
-from firmware_py.core.setpoint import REST, Glider, Trajectory, Wish, ahead_of, at_estimate, on_leash, rest_at
+from firmware_py.core.setpoint import REST, Glider, Trajectory, Wish, ahead_of, at_estimate, on_leash, rest_at, way_to_rest_s
 from firmware_py.core.supervisor import TAKES_OVER, Decision
 from firmware_py.core.transitions import Effect
 from firmware_py.core.types import COMMAND_TIMEOUT_NS, Estimate, Mode, Setpoint, Sticks
@@ -172,7 +172,8 @@ class Guidance:
         self._glider.put(at_estimate(estimate))
         self.mode, self._wrench, self._blend = mode, wrench, True
         if np.linalg.norm(difference(q_wb, estimate.q_wb)) <= NEAR_RAD:
-            self._goal = Wish(ZERO, ZERO, self._glider.at.p_wb + self._glider.at.v_w * (2.0 / self._p.bandwidth), q_wb)
+            at = self._glider.at
+            self._goal = Wish(ZERO, ZERO, at.p_wb + at.v_w * way_to_rest_s(self._p.bandwidth), q_wb)
         if before is not None:
             self._sticks, self._sticks_ns = before._sticks, before._sticks_ns
 

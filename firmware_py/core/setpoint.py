@@ -114,6 +114,13 @@ def _glide(p, q, v, w, a, alpha, wish_v, wish_w, place, attitude, bandwidth, spe
     out[3:7] = normalise(multiply(q, exp(turned)))
 
 
+def way_to_rest_s(bandwidth: float) -> float:
+    """Way that a set-point at speed, without acceleration, covers until it rests, over that speed, s: the integral of `_follow`'s response.
+    `bandwidth`: rad/s.
+    """
+    return 2.0 / bandwidth
+
+
 class Glider:
     """A set-point that changes speed smoothly: position, attitude and their first two derivatives jump only on `put`.
 

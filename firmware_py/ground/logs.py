@@ -16,7 +16,8 @@ _ENTRIES_AT_ONCE = 10
 """Entries of a list sent per round: half as many frames as pieces, since each requires a look at its file."""
 _MOST_LOGS = 100
 _MOST_BYTES = 2**32 - 1
-"""Most of a log that the protocol can address, the size that it gives for a longer one: 14 hours of one module's signals.mcap."""
+"""Most of a log that the protocol can address, the size that it gives for a longer one: 12 hours of one module's
+signals.mcap, at 100 Hz and 340 MB an hour (measured)."""
 _SUFFIXES = (".mcap", ".log")
 
 

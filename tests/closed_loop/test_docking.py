@@ -56,7 +56,8 @@ def test_both_pieces_know_where_they_are_from_the_first_pictures_after_an_undock
 def test_pair_that_docked_twice_is_to_hold_the_attitude_of_before(fly: Fly, tmp_path: Path) -> None:
     """Regression: each dock and undock kept the attitude of its moment. After six of them one module leant over by ten degrees."""
     fly(load_scenario("dock-undock-dock"), 1)
-    target, other = (read_signals(tmp_path / "run" / "signals.mcap")[f"/firmware/body{number}"] for number in (0, 1))
+    believed = read_signals(tmp_path / "run" / "signals.mcap")
+    target, other = believed["/firmware/body0"], believed["/firmware/body1"]
     docked_ns = other["time_ns"][np.flatnonzero(np.diff(other["time_ns"]) > 5e8)[0]]
     before = target["setpoint_q_wb"][np.searchsorted(target["time_ns"], docked_ns)]
     assert np.linalg.norm(difference(target["setpoint_q_wb"][-1].copy(), before.copy())) < 1e-3

@@ -168,10 +168,11 @@ def test_hull_above_another_has_its_height_for_a_reach() -> None:
         (at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0], tag_age_ns=NEVER_AGE_NS)),
         (at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), at([1.0, 0.0, 1.0], ready=False)),
         (at([0.0, 0.0, 1.0], [0.2, math.nan, 0.0]), at([1.0, 0.0, 1.0])),
+        (at([0.0, 0.0, 1.0], [0.99 * CLOSING_M_S, 0.0, 0.0]), at([0.25, 0.0, 1.0])),
         (at(ZERO, [CLOSING_M_S, 0.0, 0.0]), at([1.0, 0.0, 0.0])),
         (at([0.0, 0.0, 1.0], [0.21, 0.0, 0.0]), at([0.25, 0.0, 1.0], [0.2, 0.0, 0.0])),
     ],
-    ids=["they pass", "they part", "they fly abreast", "no tag seen", "no attitude", "no speed", "a slow bump", "one follows"],
+    ids=["they pass", "they part", "they fly abreast", "no tag seen", "no attitude", "no speed", "a slow bump", "no faster", "one follows"],
 )
 def test_bodies_that_do_not_close_in_have_no_time(first: Estimate, second: Estimate) -> None:
     assert np.isnan(pair(first, second)).all()
@@ -184,8 +185,9 @@ def test_bodies_that_are_within_reach_and_still_close_in_have_no_time_left() -> 
 
 def test_slow_bodies_that_meet_head_on_count_by_the_speed_of_both() -> None:
     assert pair(at(ZERO, [0.05, 0.0, 0.0]), at([0.4, 0.0, 0.0], [-0.05, 0.0, 0.0])) == pytest.approx([(0.4 - TOUCH_M) / 0.1] * 2)
-    one, other = pair(at(ZERO, [OWN_M_S, 0.0, 0.0]), at([1.0, 0.0, 0.0], [-0.2, 0.0, 0.0]))
-    assert math.isnan(one) and other > 0.0, "it cannot help much"
+    for own_m_s, gap_m in ((0.99 * OWN_M_S, 0.4), (OWN_M_S, 1.0)):
+        one, other = pair(at(ZERO, [own_m_s, 0.0, 0.0]), at([gap_m, 0.0, 0.0], [-0.2, 0.0, 0.0]))
+        assert math.isnan(one) and other > 0.0, "it cannot help much"
 
 
 def test_pair_that_docks_is_to_touch_and_a_third_body_is_not() -> None:

@@ -137,7 +137,7 @@ def test_logs_are_listed_and_fetched(identity: str, first: int, tmp_path: Path) 
 
 
 def test_log_beyond_what_the_protocol_can_address_ends_there(tmp_path: Path) -> None:
-    """A day of one module is 7 GB. Regression: what lies behind 4 GiB came as pieces of one and the same place."""
+    """A day of one module is 8 GB. Regression: what lies behind 4 GiB came as pieces of one and the same place."""
     (tmp_path / "signals.mcap").touch()
     os.truncate(tmp_path / "signals.mcap", 2**32 + 1000)  # takes no room on the disk
     world = World(config=GroundConfig(logs=str(tmp_path)))

@@ -158,7 +158,7 @@ def test_flushed_log_loses_nothing_when_the_process_is_killed(tmp_path: Path) ->
 
 @pytest.mark.parametrize("read", [is_closed, damaged_at, lambda path: sum(1 for _ in read_messages(path))])
 def test_long_signal_log_is_read_without_being_held_in_memory(read: Callable[[Path], object], tmp_path: Path) -> None:
-    """A day of one module is 7 GB."""
+    """A day of one module is 8 GB."""
     record_ticks(tmp_path, 2000, killed=True)
     read(tmp_path / SIGNAL_LOG)  # imports of the first call
     tracemalloc.start()

@@ -10,7 +10,7 @@ from firmware_py.core.topology import Motion, join, part_of
 from firmware_py.core.types import DockRequest
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import load_vehicle
-from firmware_py.prepare.assembly import assemble
+from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.docking import plan_dock, plan_undock
 
 VEHICLES = [load_vehicle("modcube")] * 3
@@ -235,7 +235,7 @@ def test_righting_does_not_grow_with_docks_and_undocks() -> None:
         bodies = (parted.stays, parted.leaves)
         joined = join([(body, Motion(x, np.eye(ERRORS), 10, 0)) for body, x in zip(bodies, states, strict=True)], merged)
         states = [part_of(merged, joined, body).x for body in bodies]
-    assert np.linalg.norm(joined.x[26:29]) < 2.0 * 0.5 * 0.21  # twice the lever of their lifts
+    assert np.linalg.norm(joined.x[26:29]) < 2.0 * 0.5 * PITCH_M  # twice the lever of their lifts
 
 
 def test_joined_body_is_known_no_better_than_the_worse_of_both(two: tuple[Body, Body, Body, np.ndarray, np.ndarray]) -> None:
