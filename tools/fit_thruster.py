@@ -2,8 +2,8 @@
 
     .venv/bin/python tools/fit_thruster.py bench.csv --voltage 12 --out curve.toml
 
-The CSV has a header: command (-1 to 1), force_n, and if measured voltage_v and power_w, above 0 wherever the thruster pushes. Force is
-scaled to one voltage by its square, power by its cube. Power measured at the command nearest zero, where nothing pushes, is that of the
+The CSV has a header: command (-1 to 1), force_n, and if measured voltage_v and power_w, above 0 wherever the thruster pushes. Both are
+scaled to one voltage as those of a T200 go with it. Power measured at the command nearest zero, where nothing pushes, is that of the
 electronics, which a vehicle file counts separately (idle_w), and is subtracted first. The output is the fields of a vehicle file's [curve],
 for that file or for --curve of tools/identify.py; what was not measured (power, lag, speed) comes from --vehicle.
 """
@@ -22,6 +22,7 @@ import numpy as np
 from argument_types import make_room
 from scipy.optimize import nnls
 
+from firmware_py.core.limiter import VOLTAGE_EXPONENT
 from firmware_py.description.schema import DescriptionError, Source, build, describe, did_you_mean, frozen_array, limits_of, read_toml
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
@@ -39,6 +40,9 @@ OPTIONAL = ("voltage_v", "power_w")
 MOST = 1e6
 """Largest magnitude of any number read; no thruster reaches it in W or N."""
 VOLTAGE = limits_of(ThrusterCurve, "voltage_v")
+POWER_EXPONENT = 2.1
+"""Exponent of power over supply voltage at a fixed command: T200 at 16 V against 12 V from a third of full command up, median of 150 pairs
+of the maker's table (t200_16v.csv, t200_12v.csv). A motor of no resistance, whose speed went with the voltage, would have 3."""
 
 
 def rising_polynomial(x: np.ndarray, y: np.ndarray, end: float, least: float) -> np.ndarray:
@@ -112,7 +116,7 @@ def fit_curve(points: dict[str, np.ndarray], like: ThrusterCurve, voltage_v: flo
         raise DescriptionError(f"--zero {zero_n:g}: a force of 0 N or more is needed")
     u, force = points["command"], points["force_n"].copy()
     if "voltage_v" in points:
-        force *= np.square(voltage_v / points["voltage_v"])
+        force *= (voltage_v / points["voltage_v"]) ** VOLTAGE_EXPONENT
     changed: dict[str, np.ndarray] = {}
     edges, left = [], []
     for side, sign in (("forward", 1.0), ("reverse", -1.0)):
@@ -156,8 +160,7 @@ def _propeller_power(points: dict[str, np.ndarray], works: np.ndarray, voltage_v
         raise DescriptionError(f"{side}: power_w {power.min():g} with a force; it must be above 0 wherever the thruster pushes")
     if power.max() <= idle_w:
         raise DescriptionError(f"{side}: power_w {power.max():g} at the most is not above the {idle_w:g} at zero command")
-    # At a given command, speed is proportional to voltage, force to the square of the speed, power to its cube.
-    return np.asarray((power - idle_w) * ((voltage_v / points["voltage_v"][works]) ** 3 if "voltage_v" in points else 1.0))
+    return np.asarray((power - idle_w) * ((voltage_v / points["voltage_v"][works]) ** POWER_EXPONENT if "voltage_v" in points else 1.0))
 
 
 def _number(text: str | None, path: Path, line: int) -> float:

@@ -13,6 +13,9 @@ from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
 tool = importlib.import_module("fit_thruster")
 LIKE = load_vehicle("modcube").curve
 POWERS = np.arange(1, 6)
+DATA = Path(__file__).parents[2] / "tools" / "data"
+KGF = 9.80665
+"""N."""
 
 
 def measured(noise_n: float = 0.0, voltage_v: float = 12.0, idle_w: float = 0.0) -> dict[str, np.ndarray]:
@@ -23,8 +26,9 @@ def measured(noise_n: float = 0.0, voltage_v: float = 12.0, idle_w: float = 0.0)
     force += noise_n * np.random.default_rng(0).standard_normal(len(u)) * (force != 0.0)
     side = np.where((force > 0.0)[:, None], LIKE.power_forward, LIKE.power_reverse)
     power = np.sum(np.abs(force)[:, None] ** POWERS * side, axis=1)
-    power = power * (voltage_v / 12.0) ** 3 + idle_w
-    return {"command": u, "force_n": force * (voltage_v / 12.0) ** 2, "voltage_v": np.full(len(u), voltage_v), "power_w": power}
+    power = power * (voltage_v / 12.0) ** tool.POWER_EXPONENT + idle_w
+    force *= (voltage_v / 12.0) ** tool.VOLTAGE_EXPONENT
+    return {"command": u, "force_n": force, "voltage_v": np.full(len(u), voltage_v), "power_w": power}
 
 
 def write_csv(path: Path, points: dict[str, np.ndarray]) -> Path:
@@ -43,6 +47,18 @@ def test_curve_that_was_measured_is_found_whatever_voltage_and_electronics(volta
     f = np.linspace(0.5, 7.0, 9)[:, None] ** POWERS
     assert f @ curve.power_forward == pytest.approx(f @ LIKE.power_forward, rel=1e-3)
     assert f @ curve.power_reverse == pytest.approx(f @ LIKE.power_reverse, rel=1e-3)
+
+
+def test_thruster_measured_at_16_volts_has_the_maker_s_force_and_power_at_12() -> None:
+    """T200: forward 3.71 kgf and 203 W, reverse 2.90 kgf and 204 W at 12 V (maker's table)."""
+    rows = np.genfromtxt(DATA / "t200_16v.csv", delimiter=",", names=True)
+    u, volts = (rows["pwm_us"] - 1500.0) / 400.0, np.full(len(rows), 16.0)
+    points = {"command": u, "force_n": KGF * rows["force_kgf"], "voltage_v": volts, "power_w": rows["power_w"]}
+    curve, _ = tool.fit_curve(points, LIKE, 12.0, 0.05)
+    for name, kgf, watts in (("forward", 3.71, 203.0), ("reverse", 2.90, 204.0)):
+        full_n = float(getattr(curve, name).sum())
+        assert full_n == pytest.approx(KGF * kgf, rel=0.03)
+        assert full_n**POWERS @ getattr(curve, f"power_{name}") == pytest.approx(watts, rel=0.08)
 
 
 def test_power_without_a_point_at_rest_is_taken_as_it_is() -> None:
