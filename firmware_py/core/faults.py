@@ -122,7 +122,7 @@ class FaultDetector:
         self._silent: list[int] = []
         """Modules, by place in the body, whose thrusters are left out because they are silent or hear no commands."""
         self._watches = [CommandWatch(period_ns) for _ in body.modules]
-        self._stopped = np.zeros(n, dtype=bool)
+        self._stopped: list[int] = []
         """Thrusters that may stand still because their module hears, or heard, no commands."""
         self._well: dict[int, int] = {}
         """Feedbacks in a row without a fault of each thruster that is left out because its ESC had failed."""
@@ -195,8 +195,8 @@ class FaultDetector:
             self._watches[i].step(module)
             self._late_ticks[i] = self._late_ticks[i] if module.mcu_state is None else module.late_ticks
         self._believed.append(force_n)
-        self._stopped = np.array([watch.stopped for watch in self._watches])[self._t.module]
-        free = free and not (self._stopped & self.now.alive).any()
+        self._stopped = [i for watch, at in zip(self._watches, self._thruster_at, strict=True) if watch.stopped for i in at.values()]
+        free = free and not any(self.now.alive[i] for i in self._stopped)
         found = self._motion.step(measured, estimate, mean_n * self._reported_share, self.now.alive, armed, free)
         if found is not None:
             self._lose(found, "does not push as it says")
