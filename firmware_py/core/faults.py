@@ -23,7 +23,7 @@ from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import polynomial
 from firmware_py.core.thruster_names import name_of, places_of
 from firmware_py.core.topology import in_both
-from firmware_py.core.types import Estimate, Measured, ModuleInputs
+from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 
 ESC_DOWN = (1, 3)
@@ -52,12 +52,15 @@ SILENT_NS = 500_000_000
 that still hears stops them because of the exclusion."""
 WELL_AGAIN = 10
 """Feedbacks in a row without a fault, one second's, after which a thruster whose ESC had failed is used again."""
+REPORT_NS = 75_000_000
+"""Least time between two feedbacks of an ESC that are judged: three quarters of their period (can_dbc/modcube.dbc). Of ESCs that are heard
+in every tick, the counts in a row would end within 30 ms, in which a healthy propeller may just be about to start or to reverse."""
 BELIEVED_NS = 500_000_000
 """How long believed forces are kept: the feedback of a module whose answers come late is compared with those of its own time. Against the
 present ones, propellers that reverse seemed to disobey where frames were 30 ms late each way."""
 FEEDBACK_WEIGHT = 0.3
-"""Weight of one ESC feedback in the running share of force that a thruster reports. Ten come per second (can_dbc/modcube.dbc), which gives
-a memory of 0.3 s: less than the half second of motion that core.missing_thrust judges."""
+"""Weight of one ESC feedback in the running share of force that a thruster reports. Ten are judged per second, which gives a memory of
+0.3 s: less than the half second of motion that core.missing_thrust judges."""
 
 
 class ThrusterFaults(NamedTuple):
@@ -124,6 +127,9 @@ class FaultDetector:
         self._watches = [CommandWatch(period_ns) for _ in body.modules]
         self._stopped: list[int] = []
         """Thrusters that may stand still because their module hears, or heard, no commands."""
+        self._ticks, self._report_ticks = 0, -(-REPORT_NS // period_ns)
+        self._next_report: dict[tuple[int, int], int] = {}
+        """From which tick on the next feedback is judged, by module's place in the body and first channel."""
         self._well: dict[int, int] = {}
         """Feedbacks in a row without a fault of each thruster that is left out because its ESC had failed."""
         self._believed: deque[np.ndarray] = deque(maxlen=max(1, BELIEVED_NS // period_ns))
@@ -202,9 +208,20 @@ class FaultDetector:
             self._lose(found, "does not push as it says")
         elif self._motion.acquitted is not None:
             self._use_again(self._motion.acquitted, "the robot is pushed as much without it")
-        (self._judge_feedback if armed else self._judge_at_rest)(own, self._believed_at_answers())
+        (self._judge_feedback if armed else self._judge_at_rest)(self._feedbacks(own), self._believed_at_answers())
         self._judge_silence(own, armed)
         return self.now
+
+    def _feedbacks(self, modules: list[ModuleInputs]) -> list[list[EscFeedback]]:
+        """Returns the feedbacks to judge in this tick, by module: of each pair of ESCs the newest, and none too soon after its last."""
+        self._ticks += 1
+        due: list[list[EscFeedback]] = [[] for _ in modules]
+        for i, module in enumerate(modules):
+            for first, esc in {esc.first: esc for esc in module.esc}.items():
+                if self._next_report.get((i, first), 0) <= self._ticks:
+                    self._next_report[i, first] = self._ticks + self._report_ticks
+                    due[i].append(esc)
+        return due
 
     def _believed_at_answers(self) -> np.ndarray:
         """Returns the believed forces (n,) at the time of each module's latest answer, N; the present ones where that is not kept."""
@@ -246,11 +263,11 @@ class FaultDetector:
         without = self._state_for(self._obeys & ~np.isin(self._t.module, self._silent))
         return without._replace(dead=obeying.dead) if without.lost_axes == obeying.lost_axes else obeying
 
-    def _judge_feedback(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
+    def _judge_feedback(self, feedbacks: list[list[EscFeedback]], force_n: np.ndarray) -> None:
         """Compares every ESC's feedback with the believed force of its thruster."""
         numbers: list[float] = []
-        for module, pair_at in zip(modules, self._pair_at, strict=True):
-            for esc in module.esc:
+        for escs, pair_at in zip(feedbacks, self._pair_at, strict=True):
+            for esc in escs:
                 numbers += pair_at.get(esc.first, NEITHER)
                 numbers += esc.rpm
                 numbers += esc.status
@@ -282,10 +299,10 @@ class FaultDetector:
                     del self._well[i]
                     self._use_again(i, "its ESC is well again")
 
-    def _judge_at_rest(self, modules: list[ModuleInputs], force_n: np.ndarray) -> None:
+    def _judge_at_rest(self, feedbacks: list[list[EscFeedback]], force_n: np.ndarray) -> None:
         """Warns of a propeller that turns while disarmed: somebody may be about to reach for it."""
-        for module, thruster_at in zip(modules, self._thruster_at, strict=True):
-            for esc in module.esc:
+        for escs, thruster_at in zip(feedbacks, self._thruster_at, strict=True):
+            for esc in escs:
                 for channel, rpm in enumerate(esc.rpm, esc.first):
                     if channel in thruster_at:
                         self._watch_at_rest(thruster_at[channel], rpm, force_n)

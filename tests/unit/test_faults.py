@@ -191,3 +191,25 @@ def test_feedback_that_comes_late_is_compared_with_the_forces_of_its_own_time() 
     assert "does not obey" in _said_with_late_answers(16, 0)[0], "it would matter"
     assert _said_with_late_answers(16, 16, standing=3) == ["thruster 4 of module 0 stands still: left out"]
     assert _said_with_late_answers(0, 60_000) == [], "as an answer of the future seems, after a restart"
+
+
+@pytest.mark.parametrize(("rate_hz", "every_ticks"), [(100, 10), (100, 5), (100, 1), (400, 1)])
+def test_escs_that_are_heard_more_often_are_judged_no_more_often(rate_hz: int, every_ticks: int) -> None:
+    """Regression: of ESCs heard in every tick 30 ms of standstill were enough, and healthy thrusters that just started were left out."""
+    detector, n, zero = FaultDetector(BODY, Faults(), 1_000_000_000 // rate_hz), BODY.thrusters.f_max.size, np.zeros(3)
+    estimate, force_n = Estimate(zero, np.eye(1, 4)[0], np.zeros(6), zero, zero, zero, zero, 0, 1.0, 6, 0, True), np.full(n, 2.0)
+
+    def hear(seconds: float, share: float) -> list[str]:
+        said = []
+        for tick in range(round(seconds * rate_hz)):
+            module = ModuleInputs(heard=True, mcu_state=2)
+            if tick % every_ticks == 0:
+                rpm = [share * detector.believed_rpm(i, 2.0) for i in range(n)]
+                module.esc = [EscFeedback(i, (rpm[i], rpm[i + 1]), (0.0, 0.0), (0, 0)) for i in range(0, n, 2)]
+            detector.step([module], Measured(None, None, None, []), estimate, force_n, force_n, True, True)
+            said += detector.words
+        return said
+
+    for _ in range(5):
+        assert hear(0.07, share=0.0) == [] == hear(0.93, share=1.0)
+    assert len(hear(0.4, share=0.0)) == n
