@@ -31,7 +31,7 @@ while disarmed; the others count only while armed. In a mode marked "by a fail-s
 that mode, and where it "only warns" its action does not apply. While a fail-safe with another action than warn is on, the body is not armed
 (forced arming skips this)."""
 WATCHED = """\
-- `module_silent`: no frame of a module comes, or it reports that it hears no commands (TIMEOUT in MCU_STATUS).
+- `module_silent`: no frame of a module comes, or it reports that it obeys no commands (BOOT, TIMEOUT or FAULT in MCU_STATUS).
 - `thruster_lost`: a thruster is left out because its ESC failed, or because it stands still, does not obey, or does not push as it says
   (`faults.*`). It is used again once the body is disarmed, its failed ESC has been well for a second, or the robot is pushed as much
   without it, so that it was not the cause. Thrusters that are left out with their silent module do not count.

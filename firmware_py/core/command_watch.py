@@ -1,8 +1,9 @@
-"""Whether a module hears its commands. Without them its microcontroller stops its thrusters: a standstill is no fault of theirs then."""
+"""Whether a module obeys its commands. If it starts, hears none or has a fault, it stops its thrusters: a standstill is then no fault of
+theirs."""
 
 from __future__ import annotations
 
-from firmware_py.core.types import COMMAND_TIMEOUT_NS, MCU_TIMED_OUT, ModuleInputs
+from firmware_py.core.types import COMMAND_TIMEOUT_NS, MCU_UNFIT, ModuleInputs
 
 START_NS = 300_000_000
 """How long propellers that were stopped may stand still: nearly four lags. A bus that was interrupted may first deliver in a burst the
@@ -21,7 +22,7 @@ class CommandWatch:
 
     @property
     def deaf(self) -> bool:
-        """Whether it reports that it hears no commands, or did until just now."""
+        """Whether it reports that it starts, hears no commands or has a fault, or did until just now."""
         return self._deaf > 0
 
     @property
@@ -31,8 +32,8 @@ class CommandWatch:
 
     def step(self, module: ModuleInputs) -> None:
         """Takes what came from the module since the previous tick."""
-        timed_out = module.mcu_state == MCU_TIMED_OUT
+        unfit = module.mcu_state in MCU_UNFIT
         returns = module.heard and self._unheard >= self._stopped_after
-        self._deaf = self._start_ticks if timed_out else max(0, self._deaf - 1)
-        self._starting = self._start_ticks if timed_out or returns else max(0, self._starting - 1)
+        self._deaf = self._start_ticks if unfit else max(0, self._deaf - 1)
+        self._starting = self._start_ticks if unfit or returns else max(0, self._starting - 1)
         self._unheard = 0 if module.heard else self._unheard + 1

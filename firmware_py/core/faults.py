@@ -1,9 +1,9 @@
-"""Detection of dead and lying thrusters: from ESC reports, from missing motion, and from modules that fall silent or hear no commands. Runs
+"""Detection of dead and lying thrusters: from ESC reports, from missing motion, and from modules that fall silent or obey no commands. Runs
 between estimator and supervisor.
 
 A thruster that was found faulty stays excluded until the body is disarmed, unless leaving it out shows that something else pushes
 (`thruster_trial`), or it was its ESC that failed and is well again, as after a sag of the supply. Those of a module that is silent, or
-hears no commands, stay excluded until it has been well for as long (`SILENT_NS`).
+obeys no commands, stay excluded until it has been well for as long (`SILENT_NS`).
 """
 
 from __future__ import annotations
@@ -246,7 +246,7 @@ class FaultDetector:
         if self._silent == before:
             return
         deaf = [str(self._modules[i]) for i in self._silent if self._watches[i].deaf and i not in before]
-        self.words += [f"module {', '.join(deaf)} does not hear its commands: its thrusters stop"] if deaf else []
+        self.words += [f"module {', '.join(deaf)} obeys no commands: its thrusters stop"] if deaf else []
         alive, self.now = self.now.alive, self._usable_state()
         if not np.array_equal(alive, self.now.alive):
             self.changed = True

@@ -47,7 +47,7 @@ class Health(NamedTuple):
     silent: tuple[int, ...]
     """Fleet indices of modules without a recent answer."""
     silent_s: float
-    """Longest present silence of any module; one that reports that it hears no commands counts as silent."""
+    """Longest present silence of any module; one that reports that it obeys no commands (MCU_UNFIT) counts as silent."""
     bus_silent_s: float
     """Shortest present silence of any module, or the time without a tick before this one if that is longer: a process that was stopped has
     heard nobody meanwhile, whatever it finds when it goes on."""

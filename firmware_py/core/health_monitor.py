@@ -15,7 +15,6 @@ from firmware_py.core.rotations import rotate
 from firmware_py.core.thruster_names import Place, places_of
 from firmware_py.core.types import (
     MCU_ESTOP,
-    MCU_TIMED_OUT,
     MCU_UNFIT,
     NEVER_NS,
     Action,
@@ -81,11 +80,11 @@ class HealthMonitor:
         """When an ESC was last heard that belongs to no thruster, by its place."""
         never = dict.fromkeys(body.modules, NEVER_NS)
         self._heard_ns, self._hears_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns = (never.copy() for _ in range(6))
-        self._deaf, self._unfit, self._leak, self._wet = (dict.fromkeys(body.modules, False) for _ in range(4))
+        self._unfit, self._leak, self._wet = (dict.fromkeys(body.modules, False) for _ in range(3))
         self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa = (dict[int, float]() for _ in range(4))
         self._per_module: tuple[dict[int, Any], ...] = (
-            self._heard_ns, self._hears_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns, self._deaf, self._unfit,
-            self._leak, self._wet, self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa,
+            self._heard_ns, self._hears_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns, self._unfit, self._leak,
+            self._wet, self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa,
         )  # fmt: skip
         """By fleet index: the last report of each module of the body, and its time."""
         self._stopped_ns: dict[int, int] = {}
@@ -206,8 +205,8 @@ class HealthMonitor:
             elif module.heard:
                 self._heard_ns[index] = now
             if module.mcu_state is not None:
-                self._deaf[index], self._unfit[index] = module.mcu_state == MCU_TIMED_OUT, module.mcu_state in MCU_UNFIT
-            if self._heard_ns[index] == now and not self._deaf[index]:
+                self._unfit[index] = module.mcu_state in MCU_UNFIT
+            if self._heard_ns[index] == now and not self._unfit[index]:
                 self._hears_ns[index] = now
             for tag in module.tags:
                 if tag.capture_ns > self._pictures_ns[1]:

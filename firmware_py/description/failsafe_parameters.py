@@ -155,10 +155,10 @@ class Failsafes:
     imu_lost_delay_s: float = delay(0.0, "FS_IMU_S")
     imu_lost_action: int = action(2, "FS_IMU_ACT")
     imu_lost_latched: int = latched(0, "FS_IMU_LAT")
-    # a CAN node is silent, or hears no commands
+    # a CAN node is silent, or obeys no commands
     module_silent_limit: float = quantity(
         0.5, unit="s", low=0.1, high=60,
-        help="longest permitted time in which a single module is silent, or reports that it hears no commands", mavlink="FS_MOD_LIM"
+        help="longest permitted time in which a single module is silent, or reports that it obeys no commands", mavlink="FS_MOD_LIM"
     )
     module_silent_delay_s: float = delay(0.0, "FS_MOD_S")
     module_silent_action: int = action(2, "FS_MOD_ACT")

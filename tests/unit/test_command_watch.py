@@ -34,7 +34,13 @@ def test_module_that_hears_its_commands_is_neither_deaf_nor_stopped() -> None:
     assert watched(*[WELL] * 500, TIMED_OUT).deaf and watched(*[WELL] * 500, TIMED_OUT).stopped
 
 
-@pytest.mark.parametrize("state", [state for state in (None, *MCU_UNFIT, 1, 2, 4) if state != MCU_TIMED_OUT])
+@pytest.mark.parametrize("state", MCU_UNFIT)
+def test_module_that_starts_hears_no_commands_or_has_a_fault_stops_its_thrusters(state: int) -> None:
+    watch = watched(*[WELL] * 500, ModuleInputs(mcu_state=state, heard=True))
+    assert watch.deaf and watch.stopped
+
+
+@pytest.mark.parametrize("state", [None, 1, 2, 4])
 def test_other_states_are_no_want_of_commands(state: int | None) -> None:
     watch = watched(ModuleInputs(mcu_state=state, heard=True))
     assert not watch.deaf and not watch.stopped

@@ -15,7 +15,19 @@ from firmware_py.core.health_monitor import HealthMonitor
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import exp
 from firmware_py.core.thruster_names import Place
-from firmware_py.core.types import Action, BodyPose, EscFeedback, Estimate, Inputs, Measured, ModuleInputs, Request, Sticks, TagObservation
+from firmware_py.core.types import (
+    MCU_UNFIT,
+    Action,
+    BodyPose,
+    EscFeedback,
+    Estimate,
+    Inputs,
+    Measured,
+    ModuleInputs,
+    Request,
+    Sticks,
+    TagObservation,
+)
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
@@ -105,10 +117,11 @@ def test_module_that_starts_or_is_deaf_or_has_a_fault_is_unfit_until_it_says_oth
         assert bench.step(here(mcu_state=state), here(mcu_state=state)).unfit == ()
 
 
-def test_module_that_says_that_it_hears_no_commands_counts_as_silent() -> None:
+@pytest.mark.parametrize("state", MCU_UNFIT)
+def test_module_that_says_that_it_obeys_no_commands_counts_as_silent(state: int) -> None:
     bench = MonitorBench()
     bench.step(here(mcu_state=2), here(mcu_state=2))
-    deaf_s = [bench.step(here(mcu_state=3), here(mcu_state=2)).silent_s, bench.step(here(), here(mcu_state=2)).silent_s]
+    deaf_s = [bench.step(here(mcu_state=state), here(mcu_state=2)).silent_s, bench.step(here(), here(mcu_state=2)).silent_s]
     assert 0.0 < deaf_s[0] < deaf_s[1], "frames without a status are as the status before"
     assert bench.monitor.now.bus_silent_s == 0.0 and bench.monitor.now.silent == (), "it answers"
     whole = MonitorBench()

@@ -1,10 +1,11 @@
 """Thrusters of a silent module: excluded where the others can replace them, and used again once the module is heard."""
 
 import numpy as np
+import pytest
 
 from firmware_py.core.faults import FaultDetector
 from firmware_py.core.preload import preload
-from firmware_py.core.types import CHANNELS, MCU_TIMED_OUT, EscFeedback, Estimate, Measured, ModuleInputs
+from firmware_py.core.types import CHANNELS, MCU_TIMED_OUT, MCU_UNFIT, EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -102,7 +103,7 @@ def test_body_that_is_made_of_others_leaves_out_the_modules_that_were_silent_in_
 
 def test_thrusters_that_stand_still_because_their_module_hears_no_commands_are_not_found_faulty() -> None:
     rig = DetectorRig(1)
-    assert rig.run(1.0, 0, deaf=0, force_n=2.0) == ["module 0 does not hear its commands: its thrusters stop"]
+    assert rig.run(1.0, 0, deaf=0, force_n=2.0) == ["module 0 obeys no commands: its thrusters stop"]
     assert rig.run(0.25, 0, force_n=2.0) == [], "its propellers may still be starting"
     assert rig.used == {0}
     assert rig.run(0.2, 0, force_n=2.0)[0] == "thruster 1 of module 0 stands still: left out"
@@ -111,7 +112,7 @@ def test_thrusters_that_stand_still_because_their_module_hears_no_commands_are_n
 def test_thrusters_of_a_module_that_hears_no_commands_are_left_out_until_it_does() -> None:
     rig = DetectorRig()
     said = rig.run(1.0, 0, 1, deaf=1)
-    assert said == ["module 1 does not hear its commands: its thrusters stop", "thrusters of silent module 1 are left out"]
+    assert said == ["module 1 obeys no commands: its thrusters stop", "thrusters of silent module 1 are left out"]
     assert rig.used == {0}
     assert rig.run(1.0, 0, 1) == ["thrusters of every module are used again"] and rig.used == {0, 1}
 
@@ -167,6 +168,16 @@ def test_thrusters_that_a_module_stopped_while_this_process_was_held_up_are_not_
     rig = PushingRig()
     assert rig.hear(1.0, turns=True) == [] == rig.hear(DT, turns=False, mcu_state=MCU_TIMED_OUT)
     assert rig.hear(0.3, turns=False) == [] == rig.hear(1.0, turns=True)
+
+
+@pytest.mark.parametrize("state", MCU_UNFIT)
+def test_thrusters_of_a_module_that_says_that_it_obeys_no_commands_are_not_found_dead(state: int) -> None:
+    """Regression: a microcontroller that restarted in flight, and reported from its start on, lost all its thrusters until disarming."""
+    rig = PushingRig()
+    assert rig.hear(1.0, turns=True) == []
+    assert rig.hear(1.0, turns=False, mcu_state=state) == ["module 0 obeys no commands: its thrusters stop"]
+    assert rig.hear(0.2, turns=False) == [] == rig.hear(1.0, turns=True)
+    assert rig.used == {0}
 
 
 def test_thruster_that_stands_still_after_an_interruption_of_the_bus_is_found() -> None:
