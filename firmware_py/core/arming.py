@@ -44,8 +44,10 @@ def _estop(q: Question) -> str:
     return f"an e-stop holds module {', '.join(map(str, q.health.stopped))}" if q.health.stopped else ""
 
 
-def _answers(q: Question) -> str:
-    return f"module {', '.join(str(m) for m in q.health.silent)} does not answer" if q.health.silent else ""
+def _answers(q: Question) -> list[str]:
+    late, mute = q.health.late, [m for m in q.health.silent if m not in q.health.late]
+    kinds = (mute, "does not answer"), (late, "answers too late, or for another tick")
+    return [f"module {', '.join(map(str, which))} {what}" for which, what in kinds if which]
 
 
 def _fit(q: Question) -> str:

@@ -94,6 +94,8 @@ class Health(NamedTuple):
     """Time since an attitude was last known; counts from the start until one is."""
     without_thrust: tuple[str, ...] = ()
     """Axes that no thruster of the body can push although the vehicle does not declare them passive."""
+    late: tuple[int, ...] = ()
+    """Those of `silent` from which an MCU_STATUS came lately, but of another tick than the one in which it came."""
 
     @property
     def unseen_push_m_s(self) -> float:

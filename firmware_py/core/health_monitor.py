@@ -79,12 +79,13 @@ class HealthMonitor:
         self._unknown_esc_ns: dict[Place, int] = {}
         """When an ESC was last heard that belongs to no thruster, by its place."""
         never = dict.fromkeys(body.modules, NEVER_NS)
-        self._heard_ns, self._hears_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns = (never.copy() for _ in range(6))
+        self._heard_ns, self._hears_ns, self._answered_ns, self._late_ns = (never.copy() for _ in range(4))
+        self._battery_ns, self._cabin_ns, self._wet_ns = (never.copy() for _ in range(3))
         self._unfit, self._leak, self._wet = (dict.fromkeys(body.modules, False) for _ in range(3))
         self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa = (dict[int, float]() for _ in range(4))
         self._per_module: tuple[dict[int, Any], ...] = (
-            self._heard_ns, self._hears_ns, self._answered_ns, self._battery_ns, self._cabin_ns, self._wet_ns, self._unfit, self._leak,
-            self._wet, self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa,
+            self._heard_ns, self._hears_ns, self._answered_ns, self._late_ns, self._battery_ns, self._cabin_ns, self._wet_ns, self._unfit,
+            self._leak, self._wet, self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa,
         )  # fmt: skip
         """By fleet index: the last report of each module of the body, and its time."""
         self._stopped_ns: dict[int, int] = {}
@@ -154,6 +155,7 @@ class HealthMonitor:
     def _figures(self, estimate: Estimate, faults: ThrusterFaults, stopped_ns: int) -> Health:
         """Returns all figures at the end of the tick. `stopped_ns`: by how much the tick began later than a period after the last one."""
         now, latest = self._latest.time_ns, self._latest
+        silent = tuple([m for m, at in self._answered_ns.items() if now - at > self._answer_ns])
         return Health(
             time_ns=now,
             ready=estimate.ready,
@@ -169,7 +171,7 @@ class HealthMonitor:
             cabin_c=max(self._cabin_c.values(), default=math.nan),
             cabin_change_pa=max(self._cabin_change_pa.values(), default=math.nan),
             stopped=tuple([m for m, at in self._stopped_ns.items() if m in self._heard_ns or now - at <= self._answer_ns]),
-            silent=tuple([m for m, at in self._answered_ns.items() if now - at > self._answer_ns]),
+            silent=silent,
             silent_s=(now - min(self._hears_ns.values())) * 1e-9,
             bus_silent_s=max(now - max(self._heard_ns.values()), stopped_ns) * 1e-9,
             esc_missing=tuple([self._places[i] for i in _older(self._esc_ns, now - self._esc_fresh_ns)]),
@@ -195,6 +197,7 @@ class HealthMonitor:
             collision_s=self.collision_s,
             unready_s=(now - latest.ready_ns) * 1e-9,
             without_thrust=self._without_thrust,
+            late=tuple([m for m in silent if now - self._late_ns[m] <= self._answer_ns]),
         )
 
     def _listen(self, modules: Sequence[ModuleInputs], now: int) -> None:
@@ -206,6 +209,7 @@ class HealthMonitor:
                 self._heard_ns[index] = now
             if module.mcu_state is not None:
                 self._unfit[index] = module.mcu_state in MCU_UNFIT
+                self._late_ns[index] = self._late_ns[index] if module.answered else now
             if self._heard_ns[index] == now and not self._unfit[index]:
                 self._hears_ns[index] = now
             for tag in module.tags:

@@ -45,6 +45,7 @@ def test_healthy_robot_may_be_armed_in_every_mode(mode: Mode, forced: bool) -> N
 HARD: list[tuple[Health, str]] = [
     (GOOD._replace(silent=(1,)), "module 1 does not answer"),
     (GOOD._replace(silent=(1, 4)), "module 1, 4 does not answer"),
+    (GOOD._replace(silent=(1,), late=(1,)), "module 1 answers too late, or for another tick"),
     (BLIND, "no pose yet"),
     (GOOD._replace(pilot_age_s=0.5, stick=0.04), "sticks are not neutral"),
     (GOOD._replace(warm=False), "compiled code is not warm yet"),

@@ -78,6 +78,19 @@ def here(**said: object) -> ModuleInputs:
     return ModuleInputs(heard=True, answered=True, **said)  # type: ignore[arg-type]
 
 
+def test_module_whose_answers_come_for_other_ticks_is_silent_and_late() -> None:
+    """Regression: a board that answered 6 ms after SYNC was said not to answer."""
+    bench = MonitorBench()
+    late, mute = ModuleInputs(heard=True, mcu_state=1, late_ticks=1), ModuleInputs(heard=True)
+    for _ in range(21):
+        health = bench.step(late, mute)
+    assert (health.silent, health.late) == ((1, 3), (1,))
+    for _ in range(21):
+        health = bench.step(mute, here(mcu_state=1))
+    assert (health.silent, health.late) == ((1,), ())
+    assert bench.step(here(mcu_state=1), here(mcu_state=1)).late == ()
+
+
 def test_silence_is_counted_per_module() -> None:
     bench = MonitorBench()
     bench.step(here(), here())
