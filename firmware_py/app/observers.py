@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from firmware_py.app.firmware import BusFrame
+from firmware_py.bus.mapping import InputCollector
 from firmware_py.bus.port import Port
 from firmware_py.core.types import WARNING, Event, Inputs, Outputs
 from firmware_py.runtime.recorder import Recorder
@@ -12,6 +13,22 @@ from firmware_py.runtime.recorder import Recorder
 Observer = Callable[[Sequence[BusFrame], Sequence[BusFrame], Inputs, Outputs], None]
 """Called after each tick with the frames received and sent, the inputs and the outputs."""
 FLUSH_EVERY_S = 0.5
+UNUSED = {
+    "id": "of an id that the DBC does not have",
+    "number": "whose number their message does not have",
+    "length": "of the wrong length",
+    "crc": "with a wrong CRC",
+    "counter": "with the counter of the one before",
+    "range": "with a value out of range",
+    "module": "of a module that the fleet does not have",
+    "tag_unpaired": "with one half of a tag observation",
+    "tag_stale": "of tags seen too long ago (CaptureTick, CaptureOffset)",
+    "tag_future": "of tags seen after they came (CaptureTick, CaptureOffset)",
+    "sensor": "of sensors that report a fault",
+}
+"""Words for the kinds of `InputCollector.unused`."""
+LEAST_UNUSED = 5
+"""In a second; a lost frame now and then leaves half a tag observation too."""
 
 
 def telling(say: Callable[[str], None]) -> Observer:
@@ -74,20 +91,33 @@ def recording_buses(recorder: Recorder, ports: Sequence[Port], rate_hz: int) -> 
     return observe
 
 
-def watching_buses(ports: Sequence[Port], rate_hz: int) -> Observer:
-    """An observer that checks the fault counters of the ports once a second and warns of every kind that starts to grow."""
-    counted = [dict(port.faults) for port in ports]
-    growing: list[set[str]] = [set() for _ in ports]
+def watching_bus(port: Port, rate_hz: int) -> Observer:
+    """An observer that checks the fault counters of a port once a second and warns of every kind that starts to grow."""
+    return _watching(f"bus {port.address}", lambda: port.faults, 1, rate_hz)
+
+
+def watching_frames(collector: InputCollector, rate_hz: int) -> Observer:
+    """An observer that checks once a second how many frames came and were not used, and warns of every kind that starts to do so."""
+
+    def read() -> dict[str, int]:
+        return {UNUSED[kind]: count for kind, count in collector.unused.items() if kind in UNUSED}
+
+    return _watching("frames not used", read, LEAST_UNUSED, rate_hz)
+
+
+def _watching(name: str, read: Callable[[], Mapping[str, int]], least: int, rate_hz: int) -> Observer:
+    """An observer that warns of every counter that grows by `least` in a second and did not in the second before."""
+    counted, growing = dict(read()), set[str]()
 
     def observe(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
+        nonlocal counted, growing
         if outputs.tick % rate_hz:
             return
-        for place, port in enumerate(ports):
-            now, before = dict(port.faults), counted[place]
-            grown = {kind for kind, count in now.items() if count > before[kind]}
-            if fresh := sorted(grown - growing[place]):
-                words = ", ".join(f"{now[kind] - before[kind]} {kind}" for kind in fresh)
-                outputs.events.append(Event(WARNING, f"bus {port.address}: in the last second {words}"))
-            counted[place], growing[place] = now, grown
+        now, before = dict(read()), counted
+        grown = {kind for kind, count in now.items() if count - before[kind] >= least}
+        if fresh := sorted(grown - growing):
+            words = ", ".join(f"{now[kind] - before[kind]} {kind}" for kind in fresh)
+            outputs.events.append(Event(WARNING, f"{name}: in the last second {words}"))
+        counted, growing = now, grown
 
     return observe

@@ -14,7 +14,7 @@ from firmware_py.app.estop_note import EstopNote, estop_stands, noting_estop
 from firmware_py.app.firmware import Firmware, compose, vehicles_of
 from firmware_py.app.last_flight import LastFlight, last_flight, outdate, to_arm
 from firmware_py.app.live_view import LiveView
-from firmware_py.app.observers import Observer, recording, recording_buses, telling, watching_buses
+from firmware_py.app.observers import Observer, recording, recording_buses, telling, watching_bus, watching_frames
 from firmware_py.app.operator import REARM_S, Operator, with_ground
 from firmware_py.app.realtime import RealTimeLoop, open_loop
 from firmware_py.app.service import reporting
@@ -152,9 +152,9 @@ def _observers(
 ) -> list[Observer]:
     """All observers of the loop. Those that pass events on come last, because the others may add some."""
     rate_hz = loop.firmware.fleet.rate_hz
-    buses = watching_buses(loop.ports, rate_hz)
+    watching = *(watching_bus(port, rate_hz) for port in loop.ports), watching_frames(loop.firmware.collector, rate_hz)
     told = [telling(say)] if side is None else [telling(say), side.observe]
-    return [*logs.observers, *_timing_observers(loop, rate_hz, logs.recorder, side, notifier), buses, *told]
+    return [*logs.observers, *_timing_observers(loop, rate_hz, logs.recorder, side, notifier), *watching, *told]
 
 
 def _run_loop(

@@ -67,6 +67,11 @@ class InputCollector:
         kinds = self._receivers[0].dropped
         return {kind: sum(receiver.dropped[kind] for receiver in self._receivers) for kind in kinds}
 
+    @property
+    def unused(self) -> dict[str, int]:
+        """Frames that came so far and were not used, by kind: those of `dropped` and of `faults`."""
+        return self.dropped | self.faults
+
     def sync_sent(self, tick: int, time_ns: int) -> None:
         """Records that SYNC `tick` went out at `time_ns`, from which the capture times of tags count."""
         self._sync_ns[tick % REMEMBERED_TICKS] = time_ns

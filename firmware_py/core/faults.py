@@ -126,7 +126,7 @@ class FaultDetector:
         """Modules, by place in the body, whose thrusters are left out because they are silent or hear no commands."""
         self._watches = [CommandWatch(period_ns) for _ in body.modules]
         self._stopped: list[int] = []
-        """Thrusters that may stand still because their module hears, or heard, no commands."""
+        """Thrusters that may stand still because their module obeys no commands, or did not until just now."""
         self._ticks, self._report_ticks = 0, -(-REPORT_NS // period_ns)
         self._next_report: dict[tuple[int, int], int] = {}
         """From which tick on the next feedback is judged, by module's place in the body and first channel."""

@@ -23,9 +23,9 @@ RELAY_OFF, RELAY_PULL, RELAY_PUSH = 0, 1, 2
 COMMAND_TIMEOUT_NS = 100_000_000
 """Time without commands after which a module's microcontroller stops its thrusters (can_dbc/README.md)."""
 MCU_TIMED_OUT, MCU_ESTOP = 3, 4
-"""MCU_STATUS states of a module whose thrusters stand still: it hears no commands, or is held by an e-stop."""
+"""MCU_STATUS states of a module that hears no commands, and of one that is held by an e-stop."""
 MCU_UNFIT = (0, MCU_TIMED_OUT, 5)
-"""MCU_STATUS states of a module that is starting, hears no commands, or has a fault of its own."""
+"""MCU_STATUS states of a module that is starting, hears no commands, or has a fault of its own: its thrusters stand still."""
 CRITICAL, WARNING, NOTICE, INFORMATION = 2, 4, 5, 6
 """Severities of an `Event`, numbered as in syslog and STATUSTEXT."""
 NEVER_NS = -(1 << 60)

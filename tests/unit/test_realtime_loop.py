@@ -9,9 +9,10 @@ import pytest
 
 from firmware_py.app.firmware import BusFrame, Firmware, compose
 from firmware_py.app.lockstep import Lockstep
-from firmware_py.app.observers import Observer, recording, recording_buses, telling, watching_buses
+from firmware_py.app.observers import UNUSED, Observer, recording, recording_buses, telling, watching_bus, watching_frames
 from firmware_py.app.realtime import RealTimeLoop, open_loop
 from firmware_py.bus.codec import Frame
+from firmware_py.bus.mapping import InputCollector
 from firmware_py.bus.port import open_port
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.fleet import single
@@ -103,7 +104,7 @@ def test_observer_that_fails_on_the_bench_ends_the_flight(firmware: Firmware) ->
 
 def test_what_a_bus_loses_is_told_once_while_it_goes_on(tmp_path: Path) -> None:
     with open_port(f"virtual:{tmp_path.name}") as port:
-        observe = watching_buses([port], 100)
+        observe = watching_bus(port, 100)
         told = {}
         for tick, lost in ((99, 3), (100, 0), (200, 7), (300, 0), (350, 2), (400, 0)):
             port.faults["full"] += lost
@@ -113,6 +114,20 @@ def test_what_a_bus_loses_is_told_once_while_it_goes_on(tmp_path: Path) -> None:
         99: [], 100: [f"bus {port.address}: in the last second 3 full"], 200: [], 300: [], 350: [],
         400: [f"bus {port.address}: in the last second 2 full"],
     }  # fmt: skip
+
+
+def test_frames_that_are_not_used_are_told_by_kind_unless_they_are_few(firmware: Firmware) -> None:
+    """A camera with a wrong CaptureTick, or boards that also send frames of their own, would else stop a robot from arming unexplained."""
+    collector, stale = InputCollector(firmware.fleet, firmware.codec), Frame(0x7FF, bytes(3))
+    observe = watching_frames(collector, 100)
+    told = []
+    for second, strange in ((1, 4), (2, 5), (3, 6), (4, 0), (5, 7)):
+        collector.take(0, [stale] * strange)
+        observe([], [], Inputs(100 * second, 0, []), outputs := Outputs(100 * second, 0, [], False, [], []))
+        told.append([event.text for event in outputs.events])
+    said = "frames not used: in the last second {} of an id that the DBC does not have"
+    assert told == [[], [said.format(5)], [], [], [said.format(7)]]
+    assert set(UNUSED) == set(collector.unused) - {"foreign_sync", "foreign_command"}  # of which the supervisor tells
 
 
 def test_what_a_bus_loses_is_in_the_log_second_by_second_and_in_nothing_that_a_replay_compares(tmp_path: Path) -> None:
