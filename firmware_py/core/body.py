@@ -58,7 +58,7 @@ class ThrusterSet:
 
 def rank_by(values: np.ndarray) -> int:
     """Rank of a matrix with these singular values, largest first."""
-    return int(np.sum(values > RANK_TOLERANCE * max(float(values[0]), 1e-12)))
+    return int(np.sum(values > RANK_TOLERANCE * values.max(initial=1e-12)))
 
 
 def rank_of(matrix: np.ndarray) -> int:

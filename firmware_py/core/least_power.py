@@ -12,7 +12,7 @@ import daqp
 import numpy as np
 from numba import njit
 
-from firmware_py.core.body import RANK_TOLERANCE, ThrusterSet
+from firmware_py.core.body import ThrusterSet, rank_by
 from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import total_power
 
@@ -89,6 +89,5 @@ class LeastPower:
 
 def _null_space(matrix: np.ndarray) -> np.ndarray:
     """(n, n - rank) orthonormal basis of the forces that make no wrench."""
-    _, sizes, rows = np.linalg.svd(matrix)
-    rank = int(np.sum(sizes > RANK_TOLERANCE * sizes.max(initial=0.0)))
-    return np.ascontiguousarray(rows[rank:].T)
+    _, values, rows = np.linalg.svd(matrix)
+    return np.ascontiguousarray(rows[rank_by(values) :].T)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from firmware_py.core.body import RANK_TOLERANCE, ThrusterSet
+from firmware_py.core.body import RANK_TOLERANCE, ThrusterSet, rank_by
 
 DIRECTIONS = 720
 """Directions tried in the null space; half a degree apart where it is a plane."""
@@ -44,13 +44,11 @@ def preload(
 
 def _of_module(matrix: np.ndarray, smallest_n: float) -> np.ndarray:
     """(k,) forces of the k thrusters whose wrenches are the columns of `matrix` (6, k)."""
-    if matrix.shape[1] == 0:
-        return np.zeros(0)
     _, values, rows = np.linalg.svd(matrix)
-    rank = int(np.sum(values > RANK_TOLERANCE * values[0]))
+    rank = rank_by(values)
+    if rank == matrix.shape[1]:
+        return np.zeros(rank)
     null = _settled(rows[rank:].T)
-    if null.shape[1] == 0:
-        return np.zeros(matrix.shape[1])
     reachable = np.linalg.norm(null, axis=1) > RANK_TOLERANCE
     candidates = null @ _directions(null.shape[1])
     sizes = np.abs(candidates[reachable])

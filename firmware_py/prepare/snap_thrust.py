@@ -11,7 +11,7 @@ import scipy.sparse as sparse
 from scipy.optimize import linprog
 
 from firmware_py.core import rotations
-from firmware_py.core.body import RANK_TOLERANCE, Body
+from firmware_py.core.body import RANK_TOLERANCE, Body, rank_by
 from firmware_py.core.drag_lookup import drag_wrench
 from firmware_py.core.rigid_body import coriolis_wrench, restoring_moment
 
@@ -77,7 +77,7 @@ def divide(body: Body, motion: np.ndarray) -> Division:
     """
     wanted = wrenches(body, motion)
     left, sizes, _ = np.linalg.svd(body.steered_matrix)
-    outside = left[:, int(np.sum(sizes > RANK_TOLERANCE * sizes[0])) :]
+    outside = left[:, rank_by(sizes) :]
     if not outside.size:
         return Division(wanted, np.zeros(len(wanted)), np.zeros_like(wanted))
     slope = np.stack([_change_by_lean(body, motion, axis) for axis in outside[3:].T], axis=2)
