@@ -14,7 +14,8 @@ from firmware_py.ground.mission_items import CHANGE_SPEED, DELAY, JUMP, Item, it
 from firmware_py.ground.system import Arrival, Handler, System
 
 MOST_ITEMS = 500
-_MISSION = 0
+_MISSION, _EVERY_KIND = 0, 255
+"""MAV_MISSION_TYPE."""
 _ACCEPTED, _UNSUPPORTED, _NO_SPACE, _INVALID_SEQUENCE, _DENIED, _CANCELLED = 0, 3, 4, 13, 14, 15
 _ASK_AGAIN_NS, _MOST_ASKED = 250_000_000, 20
 _ASKED_ALIKE = 4
@@ -34,7 +35,6 @@ class _Upload:
     arrival: Arrival
     count: int
     """Number of items to be uploaded, plus those that stay before them."""
-    kind: int
     items: list[Item] = field(default_factory=list)
     rest: tuple[Item, ...] = ()
     """Items that stay after the uploaded ones."""
@@ -70,7 +70,7 @@ class MissionService:
         return {
             "MISSION_COUNT": self._count,
             "MISSION_WRITE_PARTIAL_LIST": self._write_part,
-            "MISSION_REQUEST_PARTIAL_LIST": lambda a: self._acknowledge(a, _UNSUPPORTED, a.message["mission_type"]),
+            "MISSION_REQUEST_PARTIAL_LIST": lambda a: self._acknowledge(a, _UNSUPPORTED),
             "MISSION_ITEM_INT": self._item,
             "MISSION_ITEM": self._item,
             "MISSION_REQUEST_LIST": self._list,
@@ -89,41 +89,37 @@ class MissionService:
         if upload.asked >= _MOST_ASKED:
             self._upload = None
             self._system.say(WARNING, "mission transfer broke off: the old mission stays")
-            self._acknowledge(upload.arrival, _CANCELLED, upload.kind)
+            self._acknowledge(upload.arrival, _CANCELLED)
         else:
             self._ask(upload, time_ns)
 
     # ------------------------------------------------------------ upload
 
     def _count(self, arrival: Arrival) -> None:
-        count, kind = arrival.message["count"], arrival.message["mission_type"]
-        if kind != _MISSION:  # fences and rally points are not stored; an empty list is accepted
-            self._acknowledge(arrival, _UNSUPPORTED if count else _ACCEPTED, kind)
-            return
-        if count > MOST_ITEMS:
-            self._acknowledge(arrival, _NO_SPACE, kind)
-            return
-        if reason := self._upload_refusal(arrival):
-            self._deny(arrival, kind, reason)
-            return
-        if count == 0:
-            self._upload = self._ended = None
-            self._flight.replace(())
-            self._acknowledge(arrival, _ACCEPTED, kind)
-            return
-        self._upload = _Upload(arrival, count, kind)
-        self._ask(self._upload, arrival.time_ns)
+        count = arrival.message["count"]
+        if not _is_of_mission(arrival):  # fences and rally points are not stored; an empty list is accepted
+            self._acknowledge(arrival, _UNSUPPORTED if count else _ACCEPTED)
+        elif count > MOST_ITEMS:
+            self._acknowledge(arrival, _NO_SPACE)
+        elif reason := self._upload_refusal(arrival):
+            self._deny(arrival, reason)
+        elif count == 0:
+            self._drop_mission(arrival)
+        else:
+            self._upload = _Upload(arrival, count)
+            self._ask(self._upload, arrival.time_ns)
 
     def _write_part(self, arrival: Arrival) -> None:
         """Starts to replace a range of items in a mission that is not being flown; the items before and after the range stay."""
-        first, last, kind = (arrival.message[name] for name in ("start_index", "end_index", "mission_type"))
-        known = self._flight.items
-        if kind != _MISSION or not 0 <= first <= last < len(known):
-            self._acknowledge(arrival, _UNSUPPORTED if kind != _MISSION else _INVALID_SEQUENCE, kind)
+        first, last, known = arrival.message["start_index"], arrival.message["end_index"], self._flight.items
+        if not _is_of_mission(arrival):
+            self._acknowledge(arrival, _UNSUPPORTED)
+        elif not 0 <= first <= last < len(known):
+            self._acknowledge(arrival, _INVALID_SEQUENCE)
         elif reason := _FLIES if self._flight.flies else self._upload_refusal(arrival):
-            self._deny(arrival, kind, reason)
+            self._deny(arrival, reason)
         else:
-            self._upload = _Upload(arrival, last + 1, kind, list(known[:first]), known[last + 1 :], in_part=True)
+            self._upload = _Upload(arrival, last + 1, list(known[:first]), known[last + 1 :], in_part=True)
             self._ask(self._upload, arrival.time_ns)
 
     def _upload_refusal(self, arrival: Arrival) -> str:
@@ -137,13 +133,13 @@ class MissionService:
         other_channel = arrival.channel != upload.arrival.channel and upload.arrival.channel in self._system.channels
         return other_channel or not _same(upload.arrival, arrival)
 
-    def _deny(self, arrival: Arrival, kind: int, reason: str) -> None:
+    def _deny(self, arrival: Arrival, reason: str) -> None:
         self._system.say(WARNING, f"mission refused: {reason}")
-        self._acknowledge(arrival, _DENIED, kind)
+        self._acknowledge(arrival, _DENIED)
 
     def _ask(self, upload: _Upload, time_ns: int) -> None:
         upload.asked, upload.asked_ns = upload.asked + 1, time_ns
-        values = {"seq": len(upload.items), "mission_type": upload.kind, **upload.arrival.sender}
+        values = {"seq": len(upload.items), "mission_type": _MISSION, **upload.arrival.sender}
         self._system.send(upload.arrival.channel, "MISSION_REQUEST" if upload.in_old_form else "MISSION_REQUEST_INT", values)
 
     def _item(self, arrival: Arrival) -> None:
@@ -160,7 +156,7 @@ class MissionService:
             fault, why = self._flight.check_fence(item)
         if fault:
             self._system.say(WARNING, f"mission refused: item {sequence}, {why}")
-            self._end(arrival, fault, upload.kind)
+            self._end(arrival, fault)
             return
         upload.items.append(item)
         upload.asked = 0
@@ -169,36 +165,38 @@ class MissionService:
             return
         if upload.in_part and self._flight.flies:  # the mission was started meanwhile
             self._system.say(WARNING, f"mission refused: {_FLIES}")
-            self._end(arrival, _DENIED, upload.kind)
+            self._end(arrival, _DENIED)
             return
         (self._flight.amend if upload.in_part else self._flight.replace)((*upload.items, *upload.rest))
-        self._end(arrival, _ACCEPTED, upload.kind)
+        self._end(arrival, _ACCEPTED)
 
     def _item_outside_upload(self, arrival: Arrival) -> None:
         """Answers an item outside the upload in progress: a repeat of the item that ended the last one, or a place to go to at once.
 
         An item is repeated when the answer to it was lost.
         """
-        kind = arrival.message["mission_type"]
         if self._ended is not None and _is_repeat(arrival, self._ended.item):
-            self._acknowledge(arrival, self._ended.result, kind)
+            self._acknowledge(arrival, self._ended.result)
         elif arrival.message["current"] in _IMMEDIATE_CURRENT:
             self._system.say(WARNING, "a place is gone to at once by DO_REPOSITION, as COMMAND_INT")
-            self._acknowledge(arrival, _UNSUPPORTED, kind)
+            self._acknowledge(arrival, _UNSUPPORTED)
 
-    def _end(self, arrival: Arrival, result: int, kind: int) -> None:
+    def _end(self, arrival: Arrival, result: int) -> None:
         self._upload, self._ended = None, _Ended(arrival, result)
-        self._acknowledge(arrival, result, kind)
+        self._acknowledge(arrival, result)
 
     def _clear(self, arrival: Arrival) -> None:
-        kind = arrival.message["mission_type"]
-        if kind in (_MISSION, 255):
-            if self._upload is not None and self._is_of_another_station(arrival, self._upload):
-                self._deny(arrival, kind, _SENDING)
-                return
-            self._upload = self._ended = None
-            self._flight.replace(())
-        self._acknowledge(arrival, _ACCEPTED, kind)
+        if arrival.message["mission_type"] not in (_MISSION, _EVERY_KIND):
+            self._acknowledge(arrival, _ACCEPTED)
+        elif self._upload is not None and self._is_of_another_station(arrival, self._upload):
+            self._deny(arrival, _SENDING)
+        else:
+            self._drop_mission(arrival)
+
+    def _drop_mission(self, arrival: Arrival) -> None:
+        self._upload = self._ended = None
+        self._flight.replace(())
+        self._acknowledge(arrival, _ACCEPTED)
 
     def _acknowledged(self, arrival: Arrival) -> None:
         """Takes MISSION_ACK: no effect after a download; cancels an upload, unless it concerns fences or rally points."""
@@ -211,15 +209,14 @@ class MissionService:
     # ------------------------------------------------------------ download
 
     def _list(self, arrival: Arrival) -> None:
-        kind = arrival.message["mission_type"]
-        count = len(self._flight.items) if kind == _MISSION else 0
-        values = {"count": count, "mission_type": kind, **arrival.sender}
+        count = len(self._flight.items) if _is_of_mission(arrival) else 0
+        values = {"count": count, "mission_type": arrival.message["mission_type"], **arrival.sender}
         self._system.send(arrival.channel, "MISSION_COUNT", values)
 
     def _request(self, arrival: Arrival) -> None:
-        sequence, kind = arrival.message["seq"], arrival.message["mission_type"]
-        if kind != _MISSION or sequence not in range(len(self._flight.items)):
-            self._acknowledge(arrival, _INVALID_SEQUENCE, kind)
+        sequence = arrival.message["seq"]
+        if not _is_of_mission(arrival) or sequence not in range(len(self._flight.items)):
+            self._acknowledge(arrival, _INVALID_SEQUENCE)
             return
         item = self._flight.items[sequence]
         whole = arrival.message.name == "MISSION_REQUEST_INT"
@@ -230,7 +227,7 @@ class MissionService:
             **{f"param{i + 1}": value for i, value in enumerate(item.parameters)},
             "x": item.x if whole or not item.is_place else item.x * 1e-7,
             "y": item.y if whole or not item.is_place else item.y * 1e-7,
-            "z": item.z, "mission_type": kind, **arrival.sender,
+            "z": item.z, "mission_type": _MISSION, **arrival.sender,
         }  # fmt: skip
         self._system.send(arrival.channel, "MISSION_ITEM_INT" if whole else "MISSION_ITEM", values)
 
@@ -239,8 +236,8 @@ class MissionService:
         if reason:
             self._system.say(WARNING, f"mission refused: {reason}")
 
-    def _acknowledge(self, arrival: Arrival, result: int, kind: int) -> None:
-        values = {"type": result, "mission_type": kind, **arrival.sender}
+    def _acknowledge(self, arrival: Arrival, result: int) -> None:
+        values = {"type": result, "mission_type": arrival.message["mission_type"], **arrival.sender}
         self._system.send(arrival.channel, "MISSION_ACK", values)
 
 
@@ -259,7 +256,12 @@ def _is_repeat(item: Arrival, before: Arrival) -> bool:
 def _belongs_to(arrival: Arrival, upload: _Upload) -> bool:
     """Whether a message belongs to the upload. Stations may share a system id, as all QGroundControls do; the channel tells them apart."""
     told = _same(upload.arrival, arrival) and arrival.channel == upload.arrival.channel
-    return told and arrival.message["mission_type"] == upload.kind
+    return told and _is_of_mission(arrival)
+
+
+def _is_of_mission(arrival: Arrival) -> bool:
+    """Whether a message is about the mission, and not about fences or rally points."""
+    return bool(arrival.message["mission_type"] == _MISSION)
 
 
 def _same(a: Arrival, b: Arrival) -> bool:
