@@ -9,12 +9,11 @@ from firmware_py.core.types import INFORMATION, WARNING, Action
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.identity import NAMES, SETTABLE
+from firmware_py.ground.pilots import Sender, sender_of
 from firmware_py.ground.signing import KEY_BYTES, Signing
 from firmware_py.ground.system import NS_PER_S, Arrival, Handler, System
 
 TYPE_GROUND_STATION = 6
-Station = tuple[int, int, int]
-"""System id, component id, MAV_TYPE."""
 _NAK, _OPEN_TO_READ, _UNKNOWN_COMMAND, _FILE_NOT_FOUND = 129, 4, 7, 10
 """Codes of the file transfer protocol."""
 _NOT_SELECTABLE = 2
@@ -30,7 +29,7 @@ VERSION = 0x00010000
 class Watch:
     """The ground station that must not be lost. Shared by all bodies: a heartbeat that one of them hears counts for all."""
 
-    station: Station | None = None
+    station: Sender | None = None
     heard_ns: int = 0
 
 
@@ -54,15 +53,14 @@ class Presence:
         }
 
     def _heartbeat(self, arrival: Arrival) -> None:
-        """Takes a heartbeat, which counts only if system, component and type are exactly those of the watched station."""
-        m = arrival.message
-        station: Station = (m.system, m.component, m["type"])
-        if m["type"] != TYPE_GROUND_STATION or not self._config.watches(m.system, m.component):
+        """Takes a heartbeat, which counts only if it is a ground station's, and exactly that of the watched one."""
+        station = system, component = sender_of(arrival)
+        if arrival.message["type"] != TYPE_GROUND_STATION or not self._config.watches(system, component):
             return
         watch, patience_ns = self._watch, self._parameters().ground.watch_s * NS_PER_S
         if watch.station is None or arrival.time_ns - watch.heard_ns > patience_ns:
             if watch.station != station:
-                self._system.say(INFORMATION, f"ground station {m.system}/{m.component} is watched")
+                self._system.say(INFORMATION, f"ground station {system}/{component} is watched")
             watch.station = station
         if watch.station == station:
             watch.heard_ns = arrival.time_ns
