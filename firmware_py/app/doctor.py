@@ -55,14 +55,14 @@ def read_file(path: str) -> str:
         return ""
 
 
-def check_machine(folder: Path, look: Look = read_file) -> list[Finding]:
+def check_machine(folder: Path) -> list[Finding]:
     """Runs every check but those of the buses. `folder` is where logs go."""
     return [
-        check_kernel(look),
+        check_kernel(read_file),
         *check_permissions(),
-        check_governor(look),
-        check_throttle(look, os.cpu_count() or 1),
-        check_clock(look, time.gmtime().tm_year),
+        check_governor(read_file),
+        check_throttle(read_file, os.cpu_count() or 1),
+        check_clock(read_file, time.gmtime().tm_year),
         check_logs(folder),
         check_cache(),
     ]
@@ -171,10 +171,10 @@ def warm_up() -> float:
     return time.perf_counter() - began
 
 
-def check_interface(name: str, show: Callable[[str], str] | None = None) -> Finding:
-    """Checks a SocketCAN interface, from the output of `ip`."""
+def check_interface(name: str, show: Callable[[str], str]) -> Finding:
+    """Checks a SocketCAN interface, from the output of `ip` for its name (`show_link`)."""
     title = f"bus {name}"
-    text = (show or show_link)(name)
+    text = show(name)
     try:
         link: dict[str, Any] = json.loads(text)[0]
     except (ValueError, IndexError):

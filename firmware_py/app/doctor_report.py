@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from firmware_py.app.doctor import FAILED, Finding, check_interface, check_machine, lines_of
+from firmware_py.app.doctor import FAILED, Finding, check_interface, check_machine, lines_of, show_link
 from firmware_py.app.doctor_bus import judge, look_at
 from firmware_py.bus.codec import Codec
 from firmware_py.bus.port import PortError, check_kind, open_port
@@ -16,7 +16,7 @@ UNFIT = 1
 """Exit status when a check failed."""
 
 
-def examine(fleet: Fleet, folder: Path, say: Callable[[str], None], wait: Callable[[float], None] = time.sleep) -> int:
+def examine(fleet: Fleet, folder: Path, say: Callable[[str], None]) -> int:
     """Prints the findings; returns the exit status. Raises PortError for a bus of no known kind."""
     for address in fleet.buses:
         check_kind(address)
@@ -24,7 +24,7 @@ def examine(fleet: Fleet, folder: Path, say: Callable[[str], None], wait: Callab
     findings = check_machine(folder)
     for index, address in enumerate(fleet.buses):
         numbers = [module.number for module in fleet.module if module.bus == index]
-        findings += list(check_bus(address, numbers, fleet.rate_hz, codec, wait))
+        findings += list(check_bus(address, numbers, fleet.rate_hz, codec, time.sleep))
     for line in lines_of(findings):
         say(line)
     return UNFIT if any(finding.state == FAILED for finding in findings) else 0
@@ -37,7 +37,7 @@ def check_bus(
     kind, _, name = address.partition(":")
     title = f"bus {name if kind == 'socketcan' else address}"
     if kind == "socketcan":
-        interface = check_interface(name)
+        interface = check_interface(name, show_link)
         yield interface
         if interface.state == FAILED:
             return

@@ -100,7 +100,6 @@ class GroundSide:
 
     Args of the constructor:
         executor: runs the planning of missions; None starts a process for it.
-        unix_now_ns: the time of day, for signing.
         priority: SCHED_FIFO priority of the thread, for use with a real-time loop; 0: an ordinary thread.
         started: parameters before the stored ones were laid over them; None: the firmware's.
         say: receives one line about each link that is not there yet, another once it is, and one about the first error, in its own thread.
@@ -111,13 +110,12 @@ class GroundSide:
         config: GroundConfig,
         firmware: Firmware,
         executor: Executor | None = None,
-        unix_now_ns: Callable[[], int] = unix_ns,
         priority: int = 0,
         started: Parameters | None = None,
         say: Callable[[str], None] = write_line,
     ) -> None:
         """Opens the links. Raises DescriptionError for an invalid link, key file or parameter file."""
-        self._config, self._pipeline, self._unix_now_ns = config, firmware.pipeline, unix_now_ns
+        self._config, self._pipeline = config, firmware.pipeline
         self._period_ns = firmware.fleet.period_ns
         self.station = GroundStation(config, firmware.fleet, started or firmware.parameters, _signing_of(config))
         try:
@@ -165,7 +163,7 @@ class GroundSide:
     def _look(self) -> None:
         """Take the ticks that were handed over."""
         station = self.station
-        station.signing.advance(self._unix_now_ns())
+        station.signing.advance(unix_ns())
         if self.keeper is not None:
             station.picture.times = times_of(self.keeper)
         station.set_busy(self.links.busy())

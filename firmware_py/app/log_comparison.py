@@ -37,7 +37,7 @@ Found = tuple[str, str, str]
 class Comparison:
     """Compares byte by byte; with a tolerance, numbers may differ by that relative amount, and signals in frames by one count."""
 
-    def __init__(self, codec: Codec, tolerance: float = 0.0, thinned: bool = False) -> None:
+    def __init__(self, codec: Codec, tolerance: float, thinned: bool) -> None:
         """`thinned`: the log lacks the messages of a body in some ticks."""
         self._codec, self._tolerance, self._thinned = codec, tolerance, thinned
 

@@ -154,7 +154,7 @@ def _observers(
     rate_hz = loop.firmware.fleet.rate_hz
     watching = *(watching_bus(port, rate_hz) for port in loop.ports), watching_frames(loop.firmware.collector, rate_hz)
     told = [telling(say)] if side is None else [telling(say), side.observe]
-    return [*logs.observers, *_timing_observers(loop, rate_hz, logs.recorder, side, notifier), *watching, *told]
+    return [*logs.observers, *_timing_observers(loop, logs.recorder, side, notifier), *watching, *told]
 
 
 def _run_loop(
@@ -240,10 +240,10 @@ def _forget_failed_start(recorder: Recorder, folder: Path, out: Path) -> None:
 
 
 def _timing_observers(
-    loop: RealTimeLoop, rate_hz: int, recorder: Recorder | None, side: GroundSide | None, notifier: Notifier | None
+    loop: RealTimeLoop, recorder: Recorder | None, side: GroundSide | None, notifier: Notifier | None
 ) -> Iterator[Observer]:
     """Observers that report tick timing to the log, ground stations and the service manager, and port fault counters to the log."""
-    keeper = loop.rate_keeper
+    keeper, rate_hz = loop.rate_keeper, loop.firmware.fleet.rate_hz
     if side is not None:
         side.keeper = keeper
     if recorder is not None:

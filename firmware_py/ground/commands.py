@@ -67,7 +67,7 @@ class CommandService:
             MOTOR_TEST: self._motor_test,
             SET_MISSION_CURRENT: self._set_current,
             REBOOT: self._reboot,
-            MISSION_START: lambda c: self._start_mission(c, max(0, int(c.get(1)))),
+            MISSION_START: lambda c: self._start_mission(max(0, int(c.get(1)))),
             ARM: self._arm,
             DOCK: lambda c: self._dock(c, Action.DOCK),
             UNDOCK: lambda c: self._dock(c, Action.UNDOCK),
@@ -184,7 +184,7 @@ class CommandService:
         if mode is None or mode not in SETTABLE:
             return UNSUPPORTED
         if mode == Mode.AUTO:
-            return self._start_mission(command, None)
+            return self._start_mission(None)
         if mode == Mode.GUIDED and not self._steering.has_setpoint(command.arrival.time_ns):
             self._system.say(WARNING, "SET_MODE refused: set-points must stream before guided mode")
             return TEMPORARILY_REJECTED
@@ -197,12 +197,12 @@ class CommandService:
 
     # ------------------------------------------------------------ missions
 
-    def _start_mission(self, command: Command, first: int | None) -> Answer:
+    def _start_mission(self, first: int | None) -> Answer:
         return self._accept_or_refuse(self._missions.start(first), "mission", TEMPORARILY_REJECTED)
 
     def _pause(self, command: Command) -> Answer:
         if command.get(1) >= 0.5:
-            return self._start_mission(command, None)
+            return self._start_mission(None)
         return self._enter(command, Mode.POSHOLD)
 
     def _set_current(self, command: Command) -> Answer:

@@ -26,7 +26,7 @@ def request_text(request: Request) -> str:
     return json.dumps(plain, separators=(",", ":"))
 
 
-def read_request(text: str, types: Mapping[str, type] = CORE_TYPES) -> Request:
+def read_request(text: str, types: Mapping[str, type]) -> Request:
     """The request that `request_text` wrote; `types` by name. Raises ValueError for an unknown type."""
     plain = json.loads(text)
     return Request(Action[plain["action"]], plain["body"], _value(plain["argument"], types))
