@@ -70,15 +70,12 @@ class MissionFlight:
         self.items: tuple[Item, ...] = ()
         self.jobs: list[PlanJob] = []
         """Flights to be planned; the planner takes them."""
-        self._serial = 0
+        self._jobs_so_far = 0
         self._flight: Flight | None = None
         self._remaining_legs: tuple[Leg, ...] = ()
         """Legs left of a paused mission: jumps already made are not repeated."""
         self._started_at_item: int | None = None
         """Item from which the mission was last started; None while a jump restarts it, perhaps from the same item."""
-        self._plan_at_tick: int | None = None
-        """Tick at which to request the plan; None once it is requested."""
-        self._hold_by_tick = 0
         self._speed: float | None = None
         self._repeat: list[tuple[int, int]] = []
         """Number and time of each repeat of MISSION_ITEM_REACHED that is due. Only the newest item is repeated: MAVSDK takes the one that
@@ -111,8 +108,7 @@ class MissionFlight:
     @property
     def awaited(self) -> int:
         """Serial number of the job whose plan is awaited; 0: none."""
-        waits = self._flight is not None and self._plan_at_tick is None and not self._flight.arrivals_s
-        return self._serial if waits else 0
+        return self._flight.serial if self._flight is not None and not self._flight.arrivals_s else 0
 
     @property
     def flies(self) -> bool:
@@ -202,7 +198,7 @@ class MissionFlight:
     def planned(self, plan: Plan) -> None:
         """Takes a finished plan and requests tracking, unless the body has been given another task meanwhile."""
         self._end_if_taken()
-        if plan.serial != self._serial or self._flight is None:
+        if self._flight is None or plan.serial != self._flight.serial:
             return
         if plan.trajectory is None:
             self._system.say(WARNING, f"mission refused: {plan.reason}")
@@ -268,22 +264,16 @@ class MissionFlight:
             return _ANOTHER
         if mode == Mode.POSHOLD or (mode == Mode.AUTO and flight.arrivals_s):
             return ""
-        return f"the mode is {mode.name}" if flight.hold_reached or s.picture.ticks > self._hold_by_tick else ""
+        return f"the mode is {mode.name}" if flight.hold_reached or s.picture.ticks > flight.begun_tick + _HOLD_TICKS else ""
 
     def _ask_for_plan(self) -> None:
-        s = self._system.subject
-        if self._plan_at_tick is None or s.picture.ticks < self._plan_at_tick or self._flight is None or not self._flight.hold_reached:
+        flight, s = self._flight, self._system.subject
+        if flight is None or flight.serial or not flight.hold_reached or s.picture.ticks < flight.begun_tick + _SETTLE_TICKS:
             return
-        self._plan_at_tick = None
-        at, ground = s.record.setpoint, self._parameters().ground
-        self._serial += 1
-        self._flight.plan_inputs = self._plan_inputs(self._flight.legs)
-        self.jobs.append(
-            PlanJob(
-                s.body, self._serial, at.p_wb, at.q_wb, self._with_speeds(self._flight.legs), ground.mission_acceleration,
-                ground.mission_corridor_m,
-            )
-        )  # fmt: skip
+        self._jobs_so_far += 1
+        flight.serial, flight.plan_inputs = self._jobs_so_far, self._plan_inputs(flight.legs)
+        at, ground, legs = s.record.setpoint, self._parameters().ground, self._with_speeds(flight.legs)
+        self.jobs.append(PlanJob(s.body, flight.serial, at.p_wb, at.q_wb, legs, ground.mission_acceleration, ground.mission_corridor_m))
 
     def _with_speeds(self, legs: Sequence[Leg]) -> tuple[Leg, ...]:
         cruise = self._cruise
@@ -347,14 +337,12 @@ class MissionFlight:
         if self._flies_already(legs):
             return
         s = self._system.subject
-        self._serial += 1  # makes a plan still in progress obsolete
         self._system.ask(Action.SET_MODE, Mode.POSHOLD)
         changes, members = self._system.task_changes, s.picture.members(s.body)
-        self._flight = Flight(tuple(legs), self._plan_inputs(legs), task_changes=changes, members=members)
-        self._plan_at_tick, self._hold_by_tick = s.picture.ticks + _SETTLE_TICKS, s.picture.ticks + _HOLD_TICKS
+        self._flight = Flight(tuple(legs), self._plan_inputs(legs), s.picture.ticks, task_changes=changes, members=members)
 
     def _end(self, state: int) -> None:
-        flight, self._flight, self._plan_at_tick = self._flight, None, None
+        flight, self._flight = self._flight, None
         self.jobs.clear()
         if flight is not None and flight.of_mission and not flight.replaced:
             s = self._system.subject

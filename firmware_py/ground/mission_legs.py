@@ -39,13 +39,17 @@ class Flight:
     legs: tuple[Leg, ...]
     plan_inputs: tuple[Any, ...]
     """All inputs of the plan, except the start pose."""
+    begun_tick: int
+    """Tick of the request of the hold in which the body waits for the plan."""
+    serial: int = 0
+    """Serial number of the job of its plan; 0 until that is asked for."""
     arrivals_s: tuple[float, ...] = ()
     task_changes: int = 0
     """System.task_changes when the flight was requested; while it is tracked, as of the last tick."""
     members: tuple[int, ...] = ()
     """Fleet indices of the body's modules when the flight was requested: it is planned for these."""
     hold_reached: bool = False
-    """Whether the hold in which the body waits for the plan has been in force."""
+    """Whether that hold has been in force."""
     started_ns: int | None = None
     reached: int = 0
     """Number of legs that are reached."""
