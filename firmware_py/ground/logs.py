@@ -62,18 +62,14 @@ class LogService:
 
     def step(self) -> None:
         """Sends the next entries of requested lists and the next pieces of requested logs."""
-        for channel in [channel for channel in self._files if channel not in self._system.channels]:
-            del self._files[channel]
-        for channel, listing in list(self._listings.items()):
-            if channel not in self._system.channels:
-                del self._listings[channel]
-            elif channel not in self._system.busy:
-                self._send_entries(listing)
-        for channel, transfer in list(self._transfers.items()):
-            if channel not in self._system.channels:
-                del self._transfers[channel]
-            elif channel not in self._system.busy:
-                self._send_pieces(transfer)
+        for by_channel in (self._files, self._listings, self._transfers):
+            for gone in by_channel.keys() - self._system.channels.keys():
+                del by_channel[gone]
+        busy = self._system.busy
+        for listing in [listing for channel, listing in self._listings.items() if channel not in busy]:
+            self._send_entries(listing)
+        for transfer in [transfer for channel, transfer in self._transfers.items() if channel not in busy]:
+            self._send_pieces(transfer)
 
     def _send_pieces(self, t: _Transfer) -> None:
         try:
