@@ -21,6 +21,8 @@ from firmware_py.ground.tick_times import Times
 ESC_SILENT = 3
 """EscStatus of an ESC that is not heard."""
 _MOST_EVENTS = 64
+READINGS = ("voltage_v", "current_a", "pressure_pa", "water_temperature_c", "cabin_pressure_pa", "cabin_temperature_c", "leak")
+"""Readings of ModuleInputs that a ModulePicture keeps, by the same names."""
 
 
 @dataclass(slots=True)
@@ -49,26 +51,14 @@ class ModulePicture:
 
     def take(self, inputs: ModuleInputs, time_ns: int) -> None:
         """Keeps the readings that `inputs` contains."""
-        if inputs.gyro is not None:
-            self.gyro_ns = time_ns
-        if inputs.accel is not None:
-            self.accel_ns = time_ns
-        if inputs.pressure_pa is not None:
-            self.pressure_ns, self.pressure_pa = time_ns, inputs.pressure_pa
-        if inputs.water_temperature_c is not None:
-            self.water_temperature_c = inputs.water_temperature_c
-        if inputs.answered:
-            self.answered_ns = time_ns
-        if inputs.voltage_v is not None:
-            self.voltage_ns, self.voltage_v = time_ns, inputs.voltage_v
-        if inputs.current_a is not None:
-            self.current_a = inputs.current_a
-        if inputs.cabin_pressure_pa is not None:
-            self.cabin_pressure_pa = inputs.cabin_pressure_pa
-        if inputs.cabin_temperature_c is not None:
-            self.cabin_temperature_c = inputs.cabin_temperature_c
-        if inputs.leak is not None:
-            self.leak = inputs.leak
+        for name in READINGS:
+            if (reading := getattr(inputs, name)) is not None:
+                setattr(self, name, reading)
+        self.gyro_ns = self.gyro_ns if inputs.gyro is None else time_ns
+        self.accel_ns = self.accel_ns if inputs.accel is None else time_ns
+        self.pressure_ns = self.pressure_ns if inputs.pressure_pa is None else time_ns
+        self.voltage_ns = self.voltage_ns if inputs.voltage_v is None else time_ns
+        self.answered_ns = time_ns if inputs.answered else self.answered_ns
         for dock in inputs.docks:
             self.dock_current_ma[dock.first : dock.first + 3] = dock.current_ma
         for esc in inputs.esc:
