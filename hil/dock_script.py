@@ -9,7 +9,7 @@ import numpy as np
 
 from firmware_py.core.rotations import heading
 from firmware_py.core.setpoint import Trajectory, rest_at
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockRequest, Mode, Outputs, Request
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.vehicle import FACE_NAMES
@@ -70,7 +70,7 @@ class DockScript(Orders):
         asked: list[Request] = []
         for record in last.records:
             if record.body not in self._armed:
-                if record.state in ARMED:
+                if record.state == State.ARMED:
                     self._armed |= self._bodies[record.body]
                     here = rest_at(record.estimate.p_wb, heading(record.estimate.q_wb))
                     asked.append(Request(Action.HOLD, record.body, here))

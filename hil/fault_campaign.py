@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.core.transitions import ARMED, State
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import Vehicle, load_vehicle
@@ -128,7 +128,7 @@ def worst_errors(flight: Flight, names: Sequence[str]) -> tuple[float, float]:
 
 
 def _name(state: int, mode: int) -> str:
-    return Mode(mode).name if state in ARMED else State(state).name
+    return Mode(mode).name if state == State.ARMED else State(state).name
 
 
 def run_fault_campaign(pool: Pool, out: Path, seed: int = 0, progress: Callable[[int, int], None] | None = None) -> list[Cell]:

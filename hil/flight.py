@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.description.parameters import CONTROLLERS, Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.signals import read_signals
@@ -131,7 +131,7 @@ def judge_logs(
     share = len(flight.firmware["tick"]) / len(whole.firmware["tick"])
     wanted = wanted_in(scenario, flight, begin_ns)
     metrics = flight_metrics(flight, wanted=wanted, wall_s=wall_s * share, deadline_misses=deadline_misses)
-    metrics["armed_share"] = float(np.isin(flight.firmware["state"], list(ARMED)).mean()) if share else math.nan
+    metrics["armed_share"] = float((flight.firmware["state"] == State.ARMED).mean()) if share else math.nan
     if scenario.task.kind == "dock":  # which may end before its time
         metrics |= docking_metrics(scenario, folder)
     else:
@@ -156,7 +156,7 @@ def unmet_faults(scenario: Scenario, whole: Flight) -> tuple[str, ...]:
 
 def no_tag_reason(scenario: Scenario, whole: Flight) -> str:
     """Why no tag was seen in the `whole` flight, in words; empty if one was seen, or if the robot was armed without."""
-    if whole.placed.any() or np.isin(whole.firmware["state"], list(ARMED)).any():
+    if whole.placed.any() or (whole.firmware["state"] == State.ARMED).any():
         return ""
     without = [module.vehicle for module in scenario.module if not load_vehicle(module.vehicle).tag]
     tags = ", ".join(map(str, scenario.tags))
@@ -178,10 +178,10 @@ def _armed_at_all(scenario: Scenario, whole: Flight, folder: Path) -> list[Limit
     if any(check.metric == "armed_share" for check in scenario.check):
         return []
     if scenario.task.kind == "dock":
-        if np.isin(whole.firmware["state"], list(ARMED)).any():
+        if (whole.firmware["state"] == State.ARMED).any():
             return []  # the others' logs need not be read
         bodies = by_number(read_signals(folder / SIGNAL_LOG), "/firmware/body").values()
-        if any(np.isin(columns["state"], list(ARMED)).any() for columns in bodies):
+        if any((columns["state"] == State.ARMED).any() for columns in bodies):
             return []
     return [Limit("armed_share", low=ARMED_AT_ALL)]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode, Outputs, Request, Sticks
 from firmware_py.description.fleet import Fleet
 from hil.orders import Orders, is_due, is_time_to_arm
@@ -39,7 +39,7 @@ class ForceScript(Orders):
             return []
         asked: list[Request] = []
         if is_time_to_arm(time_ns, self._fleet):
-            asked += [Request(Action.ARM, r.body) for r in last.records if r.state not in ARMED]
+            asked += [Request(Action.ARM, r.body) for r in last.records if r.state != State.ARMED]
         manual = time_ns >= self._task.begin_ns - MANUAL_BEFORE_S * 1e9
         if manual and is_due(time_ns, self._fleet, STICKS_EVERY_S):
             moved = 0.0 if time_ns < self._task.begin_ns else stick_at(1e-9 * (time_ns - self._task.begin_ns), self._task.stick)

@@ -9,7 +9,7 @@ import numpy as np
 
 from firmware_py.app.firmware import compose
 from firmware_py.bus.codec import Codec, Frame, MessageCodec, Receiver
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode, Outputs, Request, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import Vehicle
@@ -113,7 +113,7 @@ def fuzz_flight(frames: int, seed: int = 0) -> Fuzzed:
         result.frames += len(taken)
         result.accepted += sum(listener.accept(frame) is not None for frame in taken)
         result.beyond += _beyond(outputs, sent, halves, world.vehicles[0])
-        result.armed_ticks += outputs.records[0].state in ARMED
+        result.armed_ticks += outputs.records[0].state == State.ARMED
     result.dropped = firmware.collector.dropped
     return result
 

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from firmware_py.core.setpoint import rest_at
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode, Outputs, Request, Setpoint, Sticks
 from firmware_py.description.fleet import Fleet
 from firmware_py.prepare import paths
@@ -35,7 +35,7 @@ class ModeScript(Orders):
         """The requests in the tick at `time_ns` since the start, given the outputs of the previous tick."""
         if last is None:
             return []
-        self._armed = self._armed or last.records[0].state in ARMED
+        self._armed = self._armed or last.records[0].state == State.ARMED
         if not self._armed:
             return [Request(Action.ARM)] if is_time_to_arm(time_ns, self._fleet) else []
         if time_ns < self._task.begin_ns:

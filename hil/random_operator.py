@@ -16,7 +16,7 @@ import numpy as np
 
 from firmware_py.app.firmware import BusFrame
 from firmware_py.core.setpoint import Trajectory, rest_at
-from firmware_py.core.transitions import ARMED, State
+from firmware_py.core.transitions import State
 from firmware_py.core.types import (
     CHANNELS,
     FACES,
@@ -168,9 +168,9 @@ def _is_finite(record: BodyRecord) -> bool:
 RULES: Mapping[str, Callable[[Seen], bool]] = {
     "flown by one body": lambda s: s.flown_by == 1,
     "commands are shares": lambda s: bool((np.abs(s.command.thrusters) <= 1.0).all()),
-    "who is not armed turns nothing": lambda s: s.record.state in ARMED or not (s.command.armed or s.command.thrusters.any()),
+    "who is not armed turns nothing": lambda s: s.record.state == State.ARMED or not (s.command.armed or s.command.thrusters.any()),
     "nobody arms unasked": lambda s: (
-        s.record.state not in ARMED
+        s.record.state != State.ARMED
         or s.was_armed
         or min(s.ticks_since_request[Action.ARM], s.ticks_since_request[Action.MOTOR_TEST]) <= SOON
     ),
@@ -209,7 +209,7 @@ def fly_with_random_operator(seed: int, duration_s: float) -> Operated:
             before = {module: each.record.state for module, each in seen.items()}
             for each in seen.values():
                 operated.broken.update(rule for rule, holds in RULES.items() if not holds(each))
-                operated.modes.update([Mode(each.record.mode).name] if each.record.state in ARMED else [])
+                operated.modes.update([Mode(each.record.mode).name] if each.record.state == State.ARMED else [])
 
         bench.fly([watch])
     return operated
@@ -228,7 +228,7 @@ def _seen(bench: Bench, operator: RandomOperator, outputs: Outputs, before: Mapp
     for module, command in enumerate(outputs.modules):
         holders = [body for body in bodies if module in body.modules]
         holder = holders[0] if holders else bodies[0]  # a module of no body breaks the first rule in any case
-        was_armed = any(before.get(other) in ARMED for other in holder.modules)
+        was_armed = any(before.get(other) == State.ARMED for other in holder.modules)
         record, state = records[holder.index], before.get(module, State.DISARMED)
         seen[module] = Seen(len(holders), record, command, state, was_armed, ticks_since_request)
     return seen

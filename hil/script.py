@@ -11,7 +11,7 @@ import numpy as np
 from firmware_py.app.firmware import vehicles_of
 from firmware_py.core import rotations
 from firmware_py.core.setpoint import Trajectory, rest_at
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Outputs, Request, Setpoint
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError, frozen_array
@@ -58,7 +58,7 @@ class Script(Orders):
             return [Request(Action.TRACK, 0, self.trajectory)]
         if self._armed or last is None:
             return []
-        if last.records[0].state in ARMED:
+        if last.records[0].state == State.ARMED:
             self._armed = True
             return [Request(Action.HOLD, 0, self.trajectory.sample(0.0))]
         return [Request(Action.ARM)] if is_time_to_arm(time_ns, self._fleet) else []

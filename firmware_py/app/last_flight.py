@@ -15,7 +15,7 @@ from firmware_py.app.estop_note import estop_stands
 from firmware_py.app.firmware import Firmware
 from firmware_py.bus.codec import Codec
 from firmware_py.core.joints import joints_of, sides
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Mode
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.signals import read_attachment
@@ -169,7 +169,7 @@ def _grounded(folder: Path) -> frozenset[int]:
     the boot that `LastFlight.armed` needs."""
     with suppress(OSError):
         ends = last_bodies(folder / SIGNAL_LOG)
-        return frozenset(body for body, end in ends.items() if end.mode == Mode.MOTOR_DETECT or end.state not in ARMED)
+        return frozenset(body for body, end in ends.items() if end.mode == Mode.MOTOR_DETECT or end.state != State.ARMED)
     return frozenset()
 
 

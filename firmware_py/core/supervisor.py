@@ -10,7 +10,7 @@ from firmware_py.core.arming import Question, against_arming, missing
 from firmware_py.core.failsafes import Failsafes, Level
 from firmware_py.core.health import Health
 from firmware_py.core.joints import modules_of
-from firmware_py.core.transitions import ARMED, MODES, ROWS, TRIGGERS, Effect, Guard, Need, State, Transition, Trigger
+from firmware_py.core.transitions import MODES, ROWS, TRIGGERS, Effect, Guard, Need, State, Transition, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Event, Mode, Request
 from firmware_py.description.parameters import Parameters
 
@@ -65,7 +65,7 @@ class Supervisor:
     @property
     def armed(self) -> bool:
         """Whether thrusters may turn."""
-        return self.state in ARMED
+        return self.state == State.ARMED
 
     @property
     def safety(self) -> Level:
@@ -165,7 +165,7 @@ class Supervisor:
 
     def _mode_after(self, row: Transition) -> Mode:
         """The present mode; POSHOLD if the body stops in a mode that no person chose or may choose: it would next be armed in it."""
-        comes_to_rest = self.armed and row.next_state not in ARMED
+        comes_to_rest = self.armed and row.next_state != State.ARMED
         chosen = self.level == Level.NONE and not self._testing and MODES[self.mode].on_request
         return Mode.POSHOLD if comes_to_rest and not chosen else self.mode
 
@@ -176,8 +176,8 @@ class Supervisor:
         if row.next_state != self.state or row.effect in TAKES_OVER:
             self.level = Level.NONE
         if row.effect == Effect.TEST_MOTOR:
-            self._testing = self._testing or self.state not in ARMED
-        elif row.effect in TAKES_OVER or row.next_state not in ARMED:
+            self._testing = self._testing or not self.armed
+        elif row.effect in TAKES_OVER or row.next_state != State.ARMED:
             self._testing = False
         self.state, self.mode = row.next_state, mode
 

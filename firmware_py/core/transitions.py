@@ -116,9 +116,6 @@ class Transition(NamedTuple):
     """The mode afterwards; None: the one that the request names, or unchanged."""
 
 
-ARMED = frozenset({State.ARMED})
-"""States in which thrusters may turn."""
-
 D, A, E = State
 T, G, F = Trigger, Guard, Effect
 

@@ -13,7 +13,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.estimator import ADRIFT_NS
 from firmware_py.core.failsafes import Level
 from firmware_py.core.rotations import rotate_back
-from firmware_py.core.transitions import ARMED, State
+from firmware_py.core.transitions import State
 from firmware_py.core.types import CHANNELS, FACES, NEVER_NS, BodyRecord, Estimate, Event, Inputs, Mode, ModuleInputs, Outputs
 from firmware_py.description.parameters import Supervision
 from firmware_py.ground.tick_times import Times
@@ -120,7 +120,7 @@ class Picture:
     def is_armed(self, body: int) -> bool:
         """Whether the body's thrusters may turn."""
         record = self.records.get(body)
-        return record is not None and record.state in ARMED
+        return record is not None and record.state == State.ARMED
 
     @property
     def any_armed(self) -> bool:
@@ -145,7 +145,7 @@ class Picture:
     def is_in_failsafe(self, body: int) -> bool:
         """Whether the body is armed and a fail-safe determines how it flies."""
         record = self.records.get(body)
-        return record is not None and record.state in ARMED and record.level > Level.NONE
+        return record is not None and record.state == State.ARMED and record.level > Level.NONE
 
     def pose_is_fresh(self, body: int) -> bool:
         """Whether the estimate is ready and its last tag is fresh."""

@@ -16,7 +16,7 @@ from contextlib import ExitStack
 import numpy as np
 
 from firmware_py.app.ground_station import GroundSide
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Mode, Outputs, Request
 from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
@@ -39,7 +39,7 @@ class Errors:
 
     def add(self, outputs: Outputs, truth_m: np.ndarray) -> None:
         record = outputs.records[0]
-        if record.state in ARMED:
+        if record.state == State.ARMED:
             name = Mode(record.mode).name
             self._square[name].append(float(np.sum((truth_m - record.setpoint.p_wb) ** 2)))
             self._place[name].append(record.setpoint.p_wb.tolist())

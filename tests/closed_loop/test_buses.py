@@ -12,7 +12,7 @@ from firmware_py.app.firmware import BusFrame
 from firmware_py.app.observers import recording
 from firmware_py.bus.codec import Frame
 from firmware_py.bus.port import Port, open_port
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
@@ -32,7 +32,7 @@ def fly(scenario: Scenario, bus: str, folder: Path, stranger: Port | None = None
     folder.mkdir()
 
     def disturb(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        if stranger is not None and outputs.records[0].state in ARMED:
+        if stranger is not None and outputs.records[0].state == State.ARMED:
             for frame in STRANGERS:
                 stranger.send(frame)
 

@@ -10,7 +10,7 @@ import pytest
 
 from firmware_py.app.firmware import BusFrame
 from firmware_py.bus.port import open_port
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
 from hil.bench import Bench, open_bench
@@ -52,7 +52,7 @@ def test_adapters_pulled_out_for_50_ms_in_flight_are_taken_up_again_and_the_modu
     begun: list[int] = []
 
     def pull(bench: Bench, tick: int, outputs: Outputs) -> None:
-        armed[tick] = outputs.records[0].state in ARMED
+        armed[tick] = outputs.records[0].state == State.ARMED
         if not begun and armed[tick] and all(armed.get(tick - ago, False) for ago in range(50)):
             begun.append(tick)
             for link in tmp_path.iterdir():

@@ -9,7 +9,7 @@ from firmware_py.core.failsafes import Level
 from firmware_py.core.joints import modules_of
 from firmware_py.core.supervisor import Decision, Supervisor
 from firmware_py.core.thruster_names import Place
-from firmware_py.core.transitions import ARMED, ROWS, TABLE, Effect, Guard, State, Transition, Trigger
+from firmware_py.core.transitions import ROWS, TABLE, Effect, Guard, State, Transition, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Event, Mode, Request
 from tests.unit.healths import BLIND, GOOD, at
 from tests.unit.supervisors import DOCK, REQUESTS, STICKS, P, ask, supervisor_in, texts
@@ -27,7 +27,7 @@ def test_every_requested_row_leads_where_it_says(r: Transition) -> None:
     mode = Mode.AUTO if r.trigger == Trigger.SET_MODE else r.mode if r.mode is not None else before
     assert decision == Decision(r.trigger, r.effect, mode, request.argument)
     assert (supervisor.state, supervisor.mode) == (r.next_state, mode)
-    assert supervisor.armed == (r.next_state in ARMED)
+    assert supervisor.armed == (r.next_state == State.ARMED)
     changed = (r.next_state, mode) != (r.state, before)
     words = f"{r.state.name} {before.name} -> {r.next_state.name} {mode.name}"
     assert supervisor.events == ([Event(INFORMATION, words)] if changed else [])

@@ -2,7 +2,7 @@
 
 import pytest
 
-from firmware_py.core.transitions import ARMED, DOCKING, MODE_TABLE, MODES, ROWS, TABLE, Effect, Guard, Need, State, Trigger
+from firmware_py.core.transitions import DOCKING, MODE_TABLE, MODES, ROWS, TABLE, Effect, Guard, Need, State, Trigger
 from firmware_py.core.types import Mode
 
 
@@ -18,7 +18,7 @@ def test_numbers_are_those_of_the_logs() -> None:
     assert [int(guard) for guard in Guard] == list(range(11))
     assert [int(effect) for effect in Effect] == list(range(9))
     assert [int(need) for need in Need] == list(range(4))
-    assert {Trigger.DOCK, Trigger.UNDOCK} == DOCKING and {State.ARMED} == ARMED
+    assert {Trigger.DOCK, Trigger.UNDOCK} == DOCKING
 
 
 def row(state: State, trigger: Trigger) -> tuple[Guard, Effect, State, Mode | None]:
@@ -47,7 +47,7 @@ def test_stopped_robot_is_left_by_clearing_alone() -> None:
 
 
 def test_thrusters_turn_only_after_arming() -> None:
-    arming = {r.trigger: r[2:] for r in TABLE if r.state not in ARMED and r.next_state in ARMED}
+    arming = {r.trigger: r[2:] for r in TABLE if r.state != State.ARMED and r.next_state == State.ARMED}
     assert arming == {
         Trigger.ARM: (Guard.ARMING_CHECKS, Effect.ENTER_MODE, State.ARMED, None),
         Trigger.FORCED_ARM: (Guard.FORCED_CHECKS, Effect.ENTER_MODE, State.ARMED, None),

@@ -16,7 +16,7 @@ import pytest
 from firmware_py.app.firmware import BusFrame
 from firmware_py.bus.codec import Codec, Frame, Receiver
 from firmware_py.bus.port import open_port
-from firmware_py.core.transitions import ARMED
+from firmware_py.core.transitions import State
 from firmware_py.core.types import Inputs, Outputs
 from hil.scenario import Scenario, load_scenario
 from tests.figures import figure
@@ -131,7 +131,7 @@ def test_flight_beside_a_stranger_s_frames_sends_what_it_sends_alone(
 
         def flood(received: Sequence[BusFrame], to_bus: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
             if outputs.tick == ARMED_TICK:  # earlier, so many bad frames would prevent arming
-                assert outputs.records[0].state in ARMED
+                assert outputs.records[0].state == State.ARMED
                 stack.enter_context(cangen_flood(link.name, FLOOD_ID, FLOOD_GAP_MS))
 
         beside = sent(record(bench, tmp_path / "beside", [flood]))
@@ -153,7 +153,7 @@ def test_foreign_sync_is_an_alarm_and_an_estop_stops_the_thrusters(link: Interfa
             if outputs.tick == ESTOP_TICK:
                 cansend(link.name, 0x01E, b"")
             events.extend(event.text for event in outputs.events)
-            armed.append(outputs.records[0].state in ARMED)
+            armed.append(outputs.records[0].state == State.ARMED)
             turning.append(bool(np.any(outputs.modules[0].thrusters)))
             mcu.append(inputs.modules[0].mcu_state)
 
@@ -190,7 +190,7 @@ def test_flight_goes_on_through_random_link_events(link: Interface, seed: int) -
         def watch(received: Sequence[BusFrame], to_bus: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
             nonlocal countdown, waiting
             module = inputs.modules[0]
-            flying = module.answered and module.mcu_state == MCU_ARMED and outputs.records[0].state in ARMED
+            flying = module.answered and module.mcu_state == MCU_ARMED and outputs.records[0].state == State.ARMED
             if outputs.tick > 200:
                 waiting = 0 if flying or day.state != "up" else waiting + 1
                 resumed.append(waiting)
