@@ -100,7 +100,7 @@ class Supervisor:
             decisions.append(self._try(Trigger.ESTOP_FRAME, None, health))
         decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger, health)]
         decisions += [self._request(request, health) for request in requests]
-        decisions += self._run_failsafes(health)
+        decisions.append(self._run_failsafes(health))
         self._was_idle = self.state == State.DISARMED and not health.stopped and not self._estop_is_fresh(health)
         return [decision for decision in decisions if decision is not None]
 
@@ -117,12 +117,11 @@ class Supervisor:
             self.raises_estop = trigger == Trigger.ESTOP
         return decision
 
-    def _run_failsafes(self, health: Health) -> list[Decision | None]:
+    def _run_failsafes(self, health: Health) -> Decision | None:
         """Reports fail-safes that begin and end, and carries out the action of the gravest one."""
-        decisions: list[Decision | None] = []
         alarms = self._failsafes.step(health, self.mode, self.level > Level.NONE, self.armed)
         if not alarms:
-            return decisions
+            return None
         begun = any(alarm.begins and alarm.level > Level.WARN for alarm in alarms)
         level = self._failsafes.level
         acts = self.armed and begun and level > self.safety
@@ -134,14 +133,11 @@ class Supervisor:
             severity = INFORMATION if not alarm.begins else CRITICAL if alarm.level > Level.HOLD else WARNING
             if acts or not alarm.again:  # a recurring one is reported only when it takes over control
                 self._say(severity, f"fail-safe {'on' if alarm.begins else 'over'}: {alarm.words}")
-        if acts:
-            for trigger in self._ladder(level, health):
-                decision = self._try(trigger, None, health)
-                if decision is not None:
-                    decisions.append(decision)
-                    self.level = level
-                    break
-        return decisions
+        for trigger in self._ladder(level, health) if acts else ():
+            if (decision := self._try(trigger, None, health)) is not None:
+                self.level = level
+                return decision
+        return None
 
     def _ladder(self, level: Level, health: Health) -> tuple[Trigger, ...]:
         """Triggers to try. In MOTOR_DETECT, a body that a test armed, or that never saw a tag, may lie on a bench: it is disarmed."""
