@@ -117,7 +117,7 @@ class Formation:
             if not pipeline.joints or pipeline.body.index in parted:
                 continue
             mine = [joint for joint in loose if joint.module in pipeline.body.modules]
-            pipeline.health.open_joint_words, pipeline.health.open_joints = _words_of(mine), tuple(map(modules_of, mine))
+            pipeline.health.open_joints = tuple(mine)
             gone = [joint for joint in apart if joint.module in pipeline.body.modules]
             pipeline.parting = pipeline.parting if gone else []  # a joint that closes briefly may drop its plan: ask again when it opens
             if gone and gone != pipeline.parting and pipeline.supervisor.armed and pipeline.supervisor.is_on("partner_lost"):
@@ -230,12 +230,3 @@ def _take_forces(pipeline: BodyPipeline, other: BodyPipeline) -> None:
         pipeline.supply.voltage_v[i] = other.supply.voltage_v[j]
     pipeline.lag.restart(*forces)
     pipeline.limiter.continue_from(limited)
-
-
-def _words_of(open_joints: Sequence[DockRequest]) -> str:
-    """Text that names the first open joint and counts the others; empty if there is none."""
-    if not open_joints:
-        return ""
-    first, more = open_joints[0], len(open_joints) - 1
-    others = f", and {more} more pairs" if more else ""
-    return f"modules {first.target_module} and {first.module} do not hold together{others}"

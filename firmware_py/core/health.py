@@ -9,6 +9,7 @@ import math
 from typing import NamedTuple
 
 from firmware_py.core.thruster_names import Place
+from firmware_py.core.types import DockRequest
 
 NEVER_S = 1e9
 """Ages at or above this mean that nothing ever came."""
@@ -72,8 +73,6 @@ class Health(NamedTuple):
     """Rank lost from the thruster matrix because of unusable thrusters."""
     warm: bool
     """Whether every stage has run at least once."""
-    open_joint_words: str
-    """Which modules should hold each other but do not, for people; empty: none."""
     tag_gap_s: float = math.nan
     """Time between the last two tag pictures, accepted or not; NaN while none come."""
     battery_age_s: float = 0.0
@@ -82,8 +81,8 @@ class Health(NamedTuple):
     """The same for cabin readings, whose frame carries the leak sensor too."""
     unfit: tuple[int, ...] = ()
     """Fleet indices of modules that report starting up, hearing no commands, or a fault."""
-    open_joints: tuple[frozenset[int], ...] = ()
-    """Modules of each joint that is open although it should hold."""
+    open_joints: tuple[DockRequest, ...] = ()
+    """Joints that are open although they should hold."""
     push_m_s: float = 0.0
     """Speed of the current that would explain the estimated horizontal disturbance force; RMS over a second."""
     esc_unknown: tuple[Place, ...] = ()
@@ -117,7 +116,16 @@ class Health(NamedTuple):
     @property
     def partner_lost(self) -> bool:
         """Whether a docked partner is lost."""
-        return self.open_joint_words != ""
+        return len(self.open_joints) > 0
+
+    @property
+    def open_joint_words(self) -> str:
+        """Names the first open joint and counts the others, for people; empty if there is none."""
+        if not self.open_joints:
+            return ""
+        first, more = self.open_joints[0], len(self.open_joints) - 1
+        others = f", and {more} more pairs" if more else ""
+        return f"modules {first.target_module} and {first.module} do not hold together{others}"
 
     @property
     def thruster_lost(self) -> bool:

@@ -18,6 +18,7 @@ from firmware_py.core.types import (
     MCU_UNFIT,
     NEVER_NS,
     Action,
+    DockRequest,
     EscFeedback,
     Estimate,
     Inputs,
@@ -99,7 +100,7 @@ class HealthMonitor:
         """Whether a trusted IMU was heard in this tick; set by the code that watches the sensors."""
         self.pressure_heard = False
         """The same for a pressure sensor."""
-        self.open_joint_words, self.open_joints = "", tuple[frozenset[int], ...]()
+        self.open_joints: tuple[DockRequest, ...] = ()
         """Set by the code that watches the docked faces."""
         self.collision_s = math.nan
         """Set by the code that compares the motions of all bodies."""
@@ -186,7 +187,6 @@ class HealthMonitor:
             dead=faults.dead,
             lost_axes=faults.lost_axes,
             warm=self.warm,
-            open_joint_words=self.open_joint_words,
             open_joints=self.open_joints,
             tag_gap_s=self._tag_gap_s(now),
             unfit=tuple([m for m, unfit in self._unfit.items() if unfit]),

@@ -184,7 +184,8 @@ class Supervisor:
             return against_arming(question, guard == Guard.FORCED_CHECKS)
         if guard == Guard.MODE_NEEDS:
             return missing(mode, health, self._p)
-        joint_holds = guard in (Guard.PARTING_PERMITTED, Guard.JOINT_OPEN) and modules_of(argument) not in health.open_joints
+        is_parting = guard in (Guard.PARTING_PERMITTED, Guard.JOINT_OPEN)
+        joint_holds = is_parting and modules_of(argument) not in map(modules_of, health.open_joints)
         if guard == Guard.JOINT_OPEN:
             return ["the body is disarmed, and the joint is not open"] if joint_holds else []
         if guard in IGNORED_FAILSAFES:

@@ -6,6 +6,7 @@ from typing import Any
 
 from firmware_py.core.failsafes import TABLE
 from firmware_py.core.health import Health
+from firmware_py.core.types import DockRequest
 from firmware_py.description.failsafe_parameters import Failsafes as Parameters
 from tests.unit.healths import GOOD
 
@@ -15,7 +16,7 @@ FIELDS: dict[str, str] = {
     "leak": "leak", "bus_silent": "bus_silent_s", "foreign_sync": "foreign_sync",
     "foreign_command": "foreign_command", "battery_critical": "voltage_share",
     "cabin_hot": "cabin_c", "cabin_pressure": "cabin_change_pa", "axis_lost": "lost_axes", "depth_unknown": "",
-    "tag_gone": "tag_age_s", "partner_lost": "open_joint_words", "estimator": "nis_ratio", "rejected": "rejected_share",
+    "tag_gone": "tag_age_s", "partner_lost": "open_joints", "estimator": "nis_ratio", "rejected": "rejected_share",
     "tag_lost": "tag_age_s", "pushed": "push_m_s", "tag_late": "tag_age_s",
     "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s",
     "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "collision": "collision_s", "ground_lost": "ground_age_s",
@@ -24,7 +25,8 @@ FIELDS: dict[str, str] = {
 }  # fmt: skip
 """Field of Health that each fail-safe judges; depth_unknown and pushed judge two (see `spoilt`)."""
 YES: dict[str, Any] = {
-    "leak": True, "foreign_sync": True, "foreign_command": True, "axis_lost": 1, "partner_lost": "0 and 1", "thruster_lost": (3,),
+    "leak": True, "foreign_sync": True, "foreign_command": True, "axis_lost": 1,
+    "partner_lost": (DockRequest(0, 0, 1, 1),), "thruster_lost": (3,),
 }  # fmt: skip
 
 

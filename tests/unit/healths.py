@@ -34,7 +34,6 @@ GOOD = Health(
     dead=(),
     lost_axes=0,
     warm=True,
-    open_joint_words="",
 )
 
 BLIND = GOOD._replace(ready=False, tag_age_s=NEVER_S, sigma_m=1e3, outside_m=math.nan)

@@ -14,7 +14,7 @@ from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.thruster_names import Place
 from firmware_py.core.transitions import State
-from firmware_py.core.types import Action, Mode, Request
+from firmware_py.core.types import Action, DockRequest, Mode, Request
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Limiter, Parameters
 from firmware_py.description.vehicle import load_vehicle, vehicle_names
@@ -65,7 +65,8 @@ SOFT: list[tuple[Health, str]] = [
     (GOOD._replace(lost_axes=1), "the thrusters left cannot make every wrench"),
     (GOOD._replace(without_thrust=("pitch",)), "pitch has no thrust: declare it in passive_dof of the vehicle file, or add thrusters"),
     (GOOD._replace(frame_errors_per_s=21.0), "21 bad frames a second, 20 permitted"),
-    (GOOD._replace(open_joint_words="module 2 is not docked as configured"), "module 2 is not docked as configured"),
+    (GOOD._replace(open_joints=(DockRequest(2, 0, 1, 1),)), "modules 1 and 2 do not hold together"),
+    (GOOD._replace(open_joints=(DockRequest(2, 0, 1, 1),) * 3), "modules 1 and 2 do not hold together, and 2 more pairs"),
 ]
 
 

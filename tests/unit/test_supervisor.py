@@ -6,7 +6,6 @@ from dataclasses import replace
 import pytest
 
 from firmware_py.core.failsafes import Level
-from firmware_py.core.joints import modules_of
 from firmware_py.core.supervisor import Decision, Supervisor
 from firmware_py.core.thruster_names import Place
 from firmware_py.core.transitions import ROWS, TABLE, Effect, Guard, State, Transition, Trigger
@@ -22,7 +21,7 @@ def test_every_requested_row_leads_where_it_says(r: Transition) -> None:
     before = Mode.MOTOR_DETECT if r.guard == Guard.IN_MOTOR_DETECT else Mode.POSHOLD
     supervisor = supervisor_in(r.state, before)
     request = REQUESTS[r.trigger]
-    health = GOOD._replace(open_joints=(modules_of(DOCK),)) if r.guard == Guard.JOINT_OPEN else GOOD
+    health = GOOD._replace(open_joints=(DOCK,)) if r.guard == Guard.JOINT_OPEN else GOOD
     (decision,) = supervisor.step(False, health, [request])
     mode = Mode.AUTO if r.trigger == Trigger.SET_MODE else r.mode if r.mode is not None else before
     assert decision == Decision(r.trigger, r.effect, mode, request.argument)

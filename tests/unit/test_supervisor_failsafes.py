@@ -6,7 +6,6 @@ import pytest
 
 from firmware_py.core.failsafes import Level
 from firmware_py.core.health import Health
-from firmware_py.core.joints import modules_of
 from firmware_py.core.supervisor import Decision, Supervisor
 from firmware_py.core.transitions import Effect, State, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Event, Mode, Request
@@ -47,11 +46,11 @@ def test_pilot_takes_over_and_keeps_it_while_the_leak_lasts() -> None:
     ("bad", "against"),
     [
         (
-            GOOD._replace(open_joint_words="0 and 1", open_joints=(modules_of(DOCK),)),
+            GOOD._replace(open_joints=(DOCK,)),
             {Action.DOCK: "a docked partner is lost", Action.UNDOCK: ""},
         ),
         (
-            GOOD._replace(open_joint_words="1 and 2", open_joints=(frozenset((1, 2)),)),
+            GOOD._replace(open_joints=(DOCK._replace(module=2),)),
             {Action.DOCK: "a docked partner is lost", Action.UNDOCK: "a docked partner is lost"},
         ),
         (GOOD._replace(leak=True), {Action.DOCK: "water in a cabin", Action.UNDOCK: "water in a cabin"}),
