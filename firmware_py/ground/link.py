@@ -36,10 +36,8 @@ class Received(NamedTuple):
 class Channel:
     """A peer at the other end of a link."""
 
-    number: int
     link: Link
     peer: Any
-    trusted: bool
     believed: bool = False
     """Whether a frame from the peer was believed; new peers displace unbelieved ones first."""
     queue: deque[bytes] = field(default_factory=lambda: deque(maxlen=_QUEUE_FRAMES))
@@ -170,7 +168,7 @@ class Links:
             if len(same) >= _MOST_PEERS:
                 self._forget(*(self._strangers(index) or same)[0])
             self._by_peer[key] = self._next
-            self.channels[self._next] = Channel(self._next, self.links[index], peer, self._trusted[index])
+            self.channels[self._next] = Channel(self.links[index], peer)
             self._next += 1
         return self._by_peer[key]
 

@@ -110,7 +110,7 @@ def test_a_client_that_does_not_read_loses_the_oldest_and_delays_nobody() -> Non
 
 
 def test_queue_keeps_the_newest() -> None:
-    channel = Channel(0, None, None, False)  # type: ignore[arg-type]
+    channel = Channel(None, None)  # type: ignore[arg-type]
     for i in range(300):
         channel.put(bytes([i % 256]))
     assert channel.dropped == 44 and channel.queue[-1] == bytes([299 % 256]) and channel.queue[0] == bytes([44])
