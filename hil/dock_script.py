@@ -52,11 +52,8 @@ class DockScript(Orders):
         if any([self._is_given_up(r, last) for r in self._running]):  # the later steps no longer make sense
             self._running, self._steps = [], []
         self._running = [r for r in self._running if not self._is_over(r, time_ns)]
-        if not self._running and self._steps:
-            while True:
-                asked += self._begin(self._steps.pop(0), time_ns, last)
-                if not self._steps or not self._steps[0].also:
-                    break
+        while self._steps and (not self._running or self._steps[0].also):
+            asked += self._begin(self._steps.pop(0), time_ns, last)
         if not self._running and not self._steps and self._over_ns is None:
             self._over_ns = time_ns
         return asked
