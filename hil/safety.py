@@ -204,23 +204,24 @@ def fly_to_estop(seed: int) -> StoppedFlight:
     scenario = dataclasses.replace(base, task=task, fault=(fault, *box))
     codec = Codec.load()
     halves = {codec.message(name).id_of(1): codec.message(name) for name in ("THRUSTER_CMD_A", "THRUSTER_CMD_B")}
-    state = {"stopped": False, "ticks": 0, "violations": 0, "was_armed": False}
+    stopped, ticks, violations, was_armed = False, 0, 0, False
 
     def watch(received: Sequence[BusFrame], sent: Sequence[BusFrame], inputs: Inputs, outputs: Outputs) -> None:
-        if state["stopped"]:
+        nonlocal stopped, ticks, violations, was_armed
+        if stopped:
             commands = [halves[frame.id].decode(frame.data) for _, frame in sent if frame.id in halves]
-            state["ticks"] += 1
-            state["violations"] += len(commands) != len(halves) or any(any(values) for values in commands)
+            ticks += 1
+            violations += len(commands) != len(halves) or any(any(values) for values in commands)
         elif inputs.estop or any(request.action == Action.ESTOP for request in inputs.requests):
-            state["stopped"] = True
+            stopped = True
         else:
-            state["was_armed"] = outputs.modules[0].armed
+            was_armed = outputs.modules[0].armed
 
     with ExitStack() as stack:
         bench = open_bench(stack, scenario, seed, Parameters(), f"virtual:estop{seed}")
         bench.script = _Nagging(bench.script, rng, at_s, by_frame)
         bench.fly([watch])
-    return StoppedFlight(int(state["ticks"]), int(state["violations"]), bool(state["was_armed"]))
+    return StoppedFlight(ticks, violations, was_armed)
 
 
 OWN_FIGURES = ("process_killed", "estop")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -68,7 +68,7 @@ class Flight:
         keep = (time_ns >= start_ns) & (time_ns <= end_ns)
         modules = tuple(rows_of(module, keep) for module in self.modules)
         lost_ns = self.lost_ns[(self.lost_ns >= start_ns) & (self.lost_ns <= end_ns)]
-        return Flight(rows_of(self.firmware, keep), rows_of(self.truth, keep), self.events, self.ticks, lost_ns, modules, self.passive)
+        return replace(self, firmware=rows_of(self.firmware, keep), truth=rows_of(self.truth, keep), lost_ns=lost_ns, modules=modules)
 
 
 def rows_of(columns: Columns, which: np.ndarray) -> Columns:

@@ -330,9 +330,9 @@ class Guidance:
         age_s = (time_ns - came_ns) * 1e-9
         v_w, w_b = (np.where(np.isnan(value), 0.0, value) for value in (point.v_w, point.w_b))
         q_wb = None if np.isnan(point.q_wb).any() else point.q_wb
+        moved = v_w * min(age_s, self._p.guided_timeout_s)
         if age_s > self._p.guided_timeout_s:
             v_w, w_b = ZERO, ZERO
-        moved = np.where(np.isnan(point.v_w), 0.0, point.v_w) * min(age_s, self._p.guided_timeout_s)
         return Wish(self._velocity_in_fence(self._glider.at.p_wb, v_w), w_b, self._inside(point.p_wb + moved), q_wb)
 
     def _follow_body(self, setpoint: Setpoint, estimate: Estimate) -> Setpoint:
