@@ -7,8 +7,8 @@ except z, whose range STICK_Z selects.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -40,19 +40,13 @@ _HAS_PITCH, _HAS_ROLL = 1, 2
 """Bits of `enabled_extensions` in MANUAL_CONTROL: the axes s and t are sent."""
 _RC_IGNORED = 0xFFFF
 """Value of a channel of RC_CHANNELS_OVERRIDE that stays as it is; 0 releases the channel."""
-BUTTONS: tuple[str, ...] = (
-    "hold", "manual", "stabilize", "depth", "disarm", "", "arm", "estop", "clear_estop", "dock", "undock", "surface",
-)  # fmt: skip
-"""Function of each joystick button, first to last; an empty name does nothing."""
-_BUTTON_MODES = {
-    "hold": Mode.POSHOLD, "manual": Mode.MANUAL, "stabilize": Mode.STABILIZE, "depth": Mode.ALT_HOLD,
-    "surface": Mode.SURFACE,
+BUTTONS: Mapping[int, tuple[Action, Any]] = {
+    0: (Action.SET_MODE, Mode.POSHOLD), 1: (Action.SET_MODE, Mode.MANUAL), 2: (Action.SET_MODE, Mode.STABILIZE),
+    3: (Action.SET_MODE, Mode.ALT_HOLD), 4: (Action.DISARM, False), 6: (Action.ARM, False), 7: (Action.ESTOP, None),
+    8: (Action.CLEAR_ESTOP, None), 9: (Action.DOCK, None), 10: (Action.UNDOCK, None), 11: (Action.SET_MODE, Mode.SURFACE),
 }  # fmt: skip
-_BUTTON_ACTIONS = {
-    "arm": Action.ARM, "disarm": Action.DISARM, "estop": Action.ESTOP, "clear_estop": Action.CLEAR_ESTOP,
-    "dock": Action.DOCK, "undock": Action.UNDOCK,
-}  # fmt: skip
-_STOPS_LAST = tuple(sorted(enumerate(BUTTONS), key=lambda button: _BUTTON_ACTIONS.get(button[1]) in STOPPING))
+"""Action and argument of each joystick button; the faces of a dock or undock are configured."""
+_STOPS_LAST = tuple(sorted(BUTTONS.items(), key=lambda button: button[1][0] in STOPPING))
 """Buttons in the order of execution when several are pressed at once: those that stop come last and prevail."""
 
 
@@ -163,9 +157,9 @@ class Steering:
         )
         fresh = self._pilots.freshly_pressed(arrival, m["buttons"] | m["buttons2"] << 16)
         steers = m["target"] == self._system.outbox.system and self._steer(Sticks(force, moment), arrival)
-        for number, name in _STOPS_LAST:
-            if fresh >> number & 1 and (steers or _BUTTON_ACTIONS.get(name) in STOPPING):
-                self._do(name)
+        for number, (action, argument) in _STOPS_LAST:
+            if fresh >> number & 1 and (steers or action in STOPPING):
+                self._do(action, argument)
 
     def _up(self, z: float) -> float:
         if z == _ABSENT:
@@ -202,18 +196,15 @@ class Steering:
             self._system.ask(Action.STICKS, sticks)
         return steers
 
-    def _do(self, name: str) -> None:
-        if name in _BUTTON_MODES:
+    def _do(self, action: Action, argument: Any) -> None:
+        if action in (Action.DOCK, Action.UNDOCK):
+            argument = self._dock
+            if argument is None:
+                self._system.say(NOTICE, f"{action.name.lower()} refused: no faces are configured for the button")
+                return
+        if action == Action.SET_MODE:
             self._system.subject.mode_number = None
-            self._system.ask(Action.SET_MODE, _BUTTON_MODES[name])
-        elif name in ("dock", "undock"):
-            if self._dock is None:
-                self._system.say(NOTICE, f"{name} refused: no faces are configured for the button")
-            else:
-                self._system.ask(_BUTTON_ACTIONS[name], self._dock)
-        elif name in _BUTTON_ACTIONS:
-            argument = False if name in ("arm", "disarm") else None
-            self._system.ask(_BUTTON_ACTIONS[name], argument)
+        self._system.ask(action, argument)
 
     # ------------------------------------------------------------ set-points
 
