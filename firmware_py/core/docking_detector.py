@@ -44,8 +44,11 @@ class PairStatus(NamedTuple):
     """Distance of the mean relative position from one pitch; NaN without fresh pictures."""
     spread_m: float
     """Distance between the means of the two newest quarters of the pictures; compared with `settled_m`."""
-    docked: bool
-    """Both hold."""
+
+    @property
+    def docked(self) -> bool:
+        """Whether both hold."""
+        return self.current and self.position
 
 
 class PairBank:
@@ -102,7 +105,7 @@ class PairBank:
         """Status of pair `i`."""
         row = self.rows[i]
         current, position = map(bool, row["holds"].tolist())
-        return PairStatus(current, position, float(row["error_m"]), float(row["spread_m"]), current and position)
+        return PairStatus(current, position, float(row["error_m"]), float(row["spread_m"]))
 
 
 class PairDetector:

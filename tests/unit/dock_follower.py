@@ -14,7 +14,7 @@ from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.docking import plan_dock
 
 TICK_NS = 10_000_000
-NEITHER = PairStatus(False, False, 0.01, 0.001, False)
+NEITHER = PairStatus(False, False, 0.01, 0.001)
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 
 

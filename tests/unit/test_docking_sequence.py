@@ -347,7 +347,7 @@ def test_module_backs_off_slowly_as_far_as_the_stand_off() -> None:
 def test_faces_that_are_still_near_while_they_push_apart_are_no_dock() -> None:
     dock = Follower()
     dock.until(Stage.RELEASE)
-    both = NEITHER._replace(current=True, position=True, docked=True)
+    both = NEITHER._replace(current=True, position=True)
     assert dock.step(both).relay == RELAY_PUSH
     dock.until(Stage.BACK_OFF, both)
     dock.until(Stage.APPROACH)
