@@ -37,11 +37,11 @@ def prepare(request: DockRequest | PartRequest, kind: str, pipeline: Pipeline, v
         vehicles: by fleet index.
     """
     present = pipeline.bodies  # once: the loop runs meanwhile, and may join or part them
-    if not isinstance(request, PartRequest) and job_key(request, present)[0] != kind:
-        return Prepared(request, None, (), DONE_SINCE[kind])
     bodies = {module: body for body in present for module in body.modules}
     if isinstance(request, PartRequest):
         return _prepare_part(request, bodies, pipeline, vehicles, pitch_m)
+    if job_key(request, present)[0] != kind:
+        return Prepared(request, None, (), DONE_SINCE[kind])
     return _prepare_dock(request, bodies, pipeline, vehicles, pitch_m)
 
 

@@ -57,8 +57,8 @@ class CommandService:
         self.reboot_asked = False
         self._table: dict[int, Callable[[Command], Answer]] = {
             LOITER_UNLIM: lambda c: self._enter(c, Mode.POSHOLD),
-            RETURN_TO_LAUNCH: self._surface,
-            LAND: self._surface,
+            RETURN_TO_LAUNCH: lambda c: self._enter(c, Mode.SURFACE),
+            LAND: lambda c: self._enter(c, Mode.SURFACE),
             SET_MODE: self._set_mode,
             CHANGE_SPEED: self._change_speed,
             TERMINATE: self._terminate,
@@ -191,9 +191,6 @@ class CommandService:
         subject = self._system.subject
         subject.mode_number = number
         return self._ask(command, Action.SET_MODE, mode, lambda: subject.picture.mode(subject.body) == mode)
-
-    def _surface(self, command: Command) -> Answer:
-        return self._enter(command, Mode.SURFACE)
 
     # ------------------------------------------------------------ missions
 
