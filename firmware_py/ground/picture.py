@@ -21,7 +21,7 @@ from firmware_py.ground.tick_times import Times
 ESC_SILENT = 3
 """EscStatus of an ESC that is not heard."""
 _MOST_EVENTS = 64
-READINGS = ("voltage_v", "current_a", "pressure_pa", "water_temperature_c", "cabin_pressure_pa", "cabin_temperature_c", "leak")
+READINGS = ("voltage_v", "current_a", "pressure_pa", "water_temperature_c", "cabin_pressure_pa", "cabin_temperature_c")
 """Readings of ModuleInputs that a ModulePicture keeps, by the same names."""
 
 
@@ -35,7 +35,6 @@ class ModulePicture:
     water_temperature_c: float = math.nan
     cabin_pressure_pa: float = math.nan
     cabin_temperature_c: float = math.nan
-    leak: bool = False
     dock_current_ma: list[float] = field(default_factory=lambda: [math.nan] * FACES)
     rpm: list[float] = field(default_factory=lambda: [0.0] * CHANNELS)
     esc_current_a: list[float] = field(default_factory=lambda: [0.0] * CHANNELS)

@@ -9,8 +9,7 @@ from __future__ import annotations
 import re
 import struct
 from collections import Counter
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pymavlink.generator.mavcrc import x25crc
 
@@ -155,12 +154,8 @@ class Encoder:
         self.system, self.component = system, component
         self._sequence = 0
 
-    def encode(self, name: str, values: Mapping[str, Any], link: int = 0) -> bytes:
-        """Returns one frame. Raises KeyError for an unknown message or field."""
-        return self.frame(name, self._dialect.by_name[name].encode(values), link)
-
-    def frame(self, name: str, payload: bytes, link: int = 0) -> bytes:
-        """Returns the frame of a payload that is already encoded."""
+    def frame(self, name: str, payload: bytes, link: int) -> bytes:
+        """Returns the frame of an encoded payload."""
         definition = self._dialect.by_name[name]
         flags = 0 if self._signing.key is None else _SIGNED
         number, sequence = definition.number, self._sequence
