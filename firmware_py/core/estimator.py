@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core import observation
-from firmware_py.core.alignment import TagAgreement, tilt_between, upright
+from firmware_py.core.alignment import AGREE_RAD, TagAgreement, tilt_between, upright
 from firmware_py.core.body import CRUISE_M_S, Body
 from firmware_py.core.depth_gate import MOST_STEP_M
 from firmware_py.core.history import WINDOW_NS, History
@@ -259,7 +259,7 @@ class Estimator:
 
     def _relocate(self, pose: BodyPose) -> None:
         """Relocates a body that was adrift once enough tags agree (`TagAgreement`); the state entries KEPT_STATES stay."""
-        if not self._tag_agreement.agrees(pose, self._anchor.x[Nominal.POSITION], self._anchor.x[Nominal.ATTITUDE]):
+        if self._contradicts_gravity(pose) or not self._agrees(pose):
             self._refuse(pose)
             return
         self._refused_in_row = 0
@@ -307,19 +307,36 @@ class Estimator:
     def _refuse(self, pose: BodyPose) -> None:
         """Counts a refused picture; after RESET_AFTER in a row starts anew from it, with what is learnt of the body (LEARNT).
 
-        One that contradicts gravity, as a flipped tag does, is no place to start from: a robot most of whose tags were flipped started anew
-        twice a second, never had a pose, and tumbled on its way up.
+        One that contradicts gravity is no place to start from: a robot whose camera was knocked by ten degrees, or most of whose tags were
+        flipped, started anew twice a second, never had a pose, and tumbled on its way up. The new pose counts at once, by the refused
+        pictures that agree; an estimate that has merely lost its place thus keeps its attitude.
         """
         self._rejected += 1
-        tilt, _ = self._by_gravity()
-        if tilt is not None and tilt_between(pose.q_wb, tilt) > FLIP_RAD:
+        if self._contradicts_gravity(pose):
             return
         self._refused_in_row += 1
-        if self._refused_in_row >= RESET_AFTER:
-            learnt = self._anchor.x[LEARNT]
-            self._start(pose)
-            sigma = np.sqrt(np.diag(self._anchor.covariance)[LEARNT_ERRORS])
-            self._anchor.x[LEARNT] = np.where(np.abs(learnt) <= LEARNT_SIGMAS * sigma, learnt, 0.0)
+        is_upright = self._agrees(pose)
+        if self._refused_in_row < RESET_AFTER or (is_upright and self._tag_agreement.count < READY_AFTER):
+            return
+        learnt = self._anchor.x[LEARNT]
+        self._start(pose)
+        self._accepted = READY_AFTER if is_upright else 1
+        sigma = np.sqrt(np.diag(self._anchor.covariance)[LEARNT_ERRORS])
+        self._anchor.x[LEARNT] = np.where(np.abs(learnt) <= LEARNT_SIGMAS * sigma, learnt, 0.0)
+
+    def _agrees(self, pose: BodyPose) -> bool:
+        """Whether the estimate, if not the place, agrees with a picture (`TagAgreement`, which counts it)."""
+        return self._tag_agreement.agrees(pose, self._anchor.x[Nominal.POSITION], self._anchor.x[Nominal.ATTITUDE])
+
+    def _contradicts_gravity(self, pose: BodyPose) -> bool:
+        """Whether a picture's tilt is flipped, or further than AGREE_RAD beyond the estimate's, from that by gravity; false where that
+        cannot be told. An acceleration turns the gravity that is felt, but from a right estimate as far as from a right picture.
+        """
+        tilt, _ = self._by_gravity()
+        if tilt is None:
+            return False
+        most_rad = AGREE_RAD + tilt_between(self._anchor.x[Nominal.ATTITUDE], tilt)
+        return tilt_between(pose.q_wb, tilt) > min(FLIP_RAD, most_rad)
 
     # ------------------------------------------------------------ from the anchor to now
 

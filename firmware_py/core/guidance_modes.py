@@ -260,9 +260,8 @@ class Guidance:
         elif was_rate_commanded:
             self._go_on(estimate)
         now = self._glider.step(wish, dt_s)
-        was_unplaced, self._was_unplaced = self._was_unplaced, not self._placed(health)
-        # when tags return, the set-point follows the body for one more tick
-        if CONTROLLED[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and (was_unplaced or self._was_unplaced)):
+        was_unplaced, self._was_unplaced = self._was_unplaced, not self._placed(health)  # when tags return, it follows for one more tick
+        if CONTROLLED[self.mode].force != Keep.ALL or (self.mode == Mode.SURFACE and (was_unplaced or self._is_elsewhere(now, estimate))):
             now = self._follow_body(now, estimate)
         return now, ahead_of(now, self._lead_s)
 
@@ -334,6 +333,10 @@ class Guidance:
         if age_s > self._p.guided_timeout_s:
             v_w, w_b = ZERO, ZERO
         return Wish(self._velocity_in_fence(self._glider.at.p_wb, v_w), w_b, self._inside(point.p_wb + moved), q_wb)
+
+    def _is_elsewhere(self, setpoint: Setpoint, estimate: Estimate) -> bool:
+        """Whether a body that surfaces is not placed, or was carried away, or its camera was: it goes up from where it is."""
+        return self._was_unplaced or bool(np.linalg.norm(setpoint.p_wb[:2] - estimate.p_wb[:2]) > NEAR_M)
 
     def _follow_body(self, setpoint: Setpoint, estimate: Estimate) -> Setpoint:
         """Moves the set-point along with the body where position is not held: horizontally, or in all axes."""

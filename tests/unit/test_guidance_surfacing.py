@@ -111,10 +111,11 @@ def test_what_was_asked_for_in_the_world_before_is_forgotten_and_what_comes_with
     assert other.run(5.0).p_wb[0] == pytest.approx(5.0, abs=0.01)
 
 
-def test_place_that_tags_tell_a_surfacing_robot_anew_is_not_swum_back_from() -> None:
+@pytest.mark.parametrize("tag_age_s", [20.0, 0.0], ids=["after a time out of sight", "carried away in sight"])
+def test_place_that_tags_tell_a_surfacing_robot_anew_is_not_swum_back_from(tag_age_s: float) -> None:
     flight = Flight()
     flight.do(Effect.ENTER_MODE, Mode.SURFACE)
-    flight.run(2.0, health=GOOD._replace(tag_age_s=20.0), follows=False)
+    flight.run(2.0, health=GOOD._replace(tag_age_s=tag_age_s), follows=False)
     flight.estimate = estimate((1.5, -1.0, 1.0))
     now = flight.run(0.01, follows=False)
     np.testing.assert_allclose(now.p_wb[:2], [1.5, -1.0], atol=1e-3)
