@@ -20,6 +20,7 @@ from collections.abc import Sequence
 from firmware_py.core.body import Body
 from firmware_py.core.depth_datum import DepthDatum
 from firmware_py.core.rotations import to_matrix
+from firmware_py.core.topology import DEPTH_BIAS_SPREAD_M
 from firmware_py.core.types import BodyPose, ExpectedDepth, ModuleInputs
 from firmware_py.description.water import ATMOSPHERE_PA, PA_PER_M
 
@@ -29,7 +30,9 @@ MOST_RATING = 1.5
 """Greatest depth that a reading may tell, as a multiple of the vehicle's depth rating; deeper, its hull would not be whole."""
 GATE_SIGMAS, LEAST_GATE_M = 5.0, 0.04
 """Half width of the gate, in sigmas of the innovation, and the least. On the bench healthy sensors differ from the estimate by 33 mm at
-most, in force-tracking, elsewhere by 15. With a gate of 50 mm a sensor that drifts by 20 cm/s takes the estimate along."""
+most, in force-tracking, elsewhere by 15. With a gate of 50 mm a sensor that drifts by 20 cm/s takes the estimate along. In a body of
+several modules each differs from the mean bias that the estimate knows, so that the gate is wider; in the mean of all, a reading counts
+for less than within the least gate alone."""
 MOST_STEP_M = 0.5
 """Largest offset that a sensor may take on in flight: five sigmas of the filter's initial depth bias."""
 MOST_SPEED_M_S, DROP_SPEED_M_S = 2.0, 6.0
@@ -59,6 +62,8 @@ class DepthGate:
         self._sensors = {module: _Sensor() for module in body.modules}
         self._r_bi = body.r_bi
         """(m, 3) places of the sensors, in the order of `_sensors`."""
+        self._spread_m = DEPTH_BIAS_SPREAD_M * math.sqrt(1.0 - 1.0 / len(body.modules))
+        """Sigma of a sensor's bias less the mean of all."""
         self.heard = False
 
     def take_over(self, before: Sequence[DepthGate]) -> None:
@@ -91,7 +96,8 @@ class DepthGate:
             pressure_pa = modules[index].pressure_pa
             if pressure_pa is None:
                 continue
-            passed = LEAST_PA <= pressure_pa <= self._most_pa and sensor.passes(time_ns, pressure_pa, expected, below_m[k], armed)
+            is_possible = LEAST_PA <= pressure_pa <= self._most_pa
+            passed = is_possible and sensor.passes(time_ns, pressure_pa, expected, below_m[k], self._spread_m, armed)
             self.heard = self.heard or passed
             if not passed or sensor.offset_m:
                 corrected_pa = pressure_pa - sensor.offset_m * PA_PER_M if passed else None
@@ -118,14 +124,22 @@ class _Sensor:
         self._unbroken, self._only_jumped = 0, False
         """Readings since it last jumped; whether a jump is all that it is distrusted for."""
 
-    def passes(self, time_ns: int, pressure_pa: float, expected: ExpectedDepth | None, below_m: float, armed: bool) -> bool:
-        """Whether a possible reading may be used. `below_m` is how far the sensor is expected below the centre of mass."""
+    def passes(
+        self, time_ns: int, pressure_pa: float, expected: ExpectedDepth | None, below_m: float, spread_m: float, armed: bool
+    ) -> bool:
+        """Whether a possible reading may be used.
+
+        Args:
+            below_m: how far the sensor is expected below the centre of mass.
+            spread_m: sigma of what it tells beyond the mean of the body's sensors, which the estimate knows.
+        """
         told_m = (pressure_pa - ATMOSPHERE_PA) / PA_PER_M
         self.hear(time_ns, told_m, MOST_SPEED_M_S if armed else DROP_SPEED_M_S)
         if expected is None:
             return self.is_continuous(armed)
         most_m = MOST_STEP_M if armed and self.was_trusted else math.inf
-        return self.agrees(told_m - below_m - expected.depth_m, max(LEAST_GATE_M, GATE_SIGMAS * expected.sigma_m), most_m)
+        gate_m = max(LEAST_GATE_M, GATE_SIGMAS * math.hypot(expected.sigma_m, spread_m))
+        return self.agrees(told_m - below_m - expected.depth_m, gate_m, most_m)
 
     def hear(self, time_ns: int, depth_m: float, speed_m_s: float) -> None:
         """Notes a possible reading, and whether the sensor jumped to it: farther than a body goes at `speed_m_s` since the one before."""

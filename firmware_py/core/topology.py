@@ -19,7 +19,8 @@ JOINED_SIGMA = (0.003, 0.01, 0.01, 0.03)
 PARTED_SIGMA = (0.07, 0.05, 0.07, 0.1)
 """The same for a parted body: magnets push the pieces apart for up to a second (`release_s`) before they are flown as two. On the bench
 each has by then moved 70 mm and 0.05 rad, at 70 mm/s and 0.1 rad/s (dock-undock-dock, seed 1)."""
-BIAS_SPREAD = np.repeat([0.005, 0.05, 0.02], [3, 3, 1])
+DEPTH_BIAS_SPREAD_M = 0.02
+BIAS_SPREAD = np.repeat([0.005, 0.05, DEPTH_BIAS_SPREAD_M], [3, 3, 1])
 """(7,) sigma of the biases of gyro, rad/s, accelerometer, m/s^2, and depth, m, between modules (synthetic, as the bench draws
 them). A body estimates their mean."""
 BIASES = np.r_[Error.GYRO_BIAS, Error.ACCEL_BIAS, Error.DEPTH_BIAS]

@@ -88,6 +88,15 @@ def test_gate_is_as_wide_as_the_filter_is_unsure() -> None:
     assert told(trusted(), [3.49, 3.51], unsure) == [3.49, None]
 
 
+def test_sensor_of_several_may_differ_from_their_mean_as_biases_do() -> None:
+    """The estimate knows their mean bias alone: one of four that was 37 mm off it was half refused, and the depth 5 mm wrong."""
+    four = DepthGate(assemble([(i, 0, 0) for i in range(4)], [0] * 4, [load_vehicle("modcube")] * 4))
+    for off_m, is_used in ((0.08, True), (0.09, False)):
+        readings = [ModuleInputs(pressure_pa=pressure_at(3.0 + off)) for off in (off_m, 0.0, 0.0, 0.0)]
+        left = [module.pressure_pa is not None for module in four.step(next(CLOCK), readings, AT_3_M, True)]
+        assert left == [is_used, True, True, True]
+
+
 def test_sensor_that_errs_by_metres_is_not_believed_with_tags_nor_without_until_it_agrees_with_them_again() -> None:
     gate = trusted()
     assert told(gate, [8.0] * (3 * DOUBT)) == [None] * (3 * DOUBT)
