@@ -153,21 +153,18 @@ class Measurements:
         return depth_m
 
     def _depth_offset(self, which: list[bool], each_m: np.ndarray) -> float:
-        """Returns the correction to subtract from the mean depth of the sensors heard in this tick, m.
+        """Returns the correction to subtract from the mean depth of the sensors heard in this tick, m: its offset from the mean of all.
 
-        Where some have fallen silent, it is the offset of that mean from the mean of all. It is 0 while none has: healthy sensors take
-        turns, a few ticks apart, and the estimator learns the bias of their mean.
+        Healthy sensors take turns, a few ticks apart, and some may have fallen silent; the estimator learns the bias of the mean of all.
 
         Args:
             which: per module of the body, whether its sensor was heard. each_m: (heard,) depth of the centre of mass by each of those.
         """
         self._depth_age += 1
         self._depth_age[which], self._depths_m[which] = 0, each_m
-        if self._depth_age.max() > self._pressure_silent_ticks:
-            return float(self._depth_offsets.mean_offset(which)[0])
-        if self._is_still:
+        if self._is_still and self._depth_age.max() <= self._pressure_silent_ticks:
             self._depth_offsets.learn((self._depths_m - self._depths_m.mean()).reshape(-1, 1))
-        return 0.0
+        return 0.0 if all(which) else float(self._depth_offsets.mean_offset(which)[0])
 
     def _poses(self, mine: list[ModuleInputs], q_wb: np.ndarray) -> list[BodyPose]:
         """Returns one pose per picture, oldest first."""
