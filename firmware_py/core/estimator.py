@@ -101,7 +101,7 @@ class Estimator:
         """Ticks without an estimate."""
         self._forget()
         self.retune(parameters)
-        self._refused_in_row, self._rejected = 0, 0
+        self._refused_in_row, self._rejected, self._starts = 0, 0, 0
         self._depth_variance = math.inf
         self._last_tag_ns, self._last_accept_ns = NEVER_NS, 0
         """Capture time of the newest accepted tag, and time of the tick in which it was accepted or the estimate started."""
@@ -211,6 +211,7 @@ class Estimator:
         self._anchor = self._head = Belief(x, np.diag(sigma**2), pose.capture_ns)
         self._last_tag_ns, self._last_accept_ns = pose.capture_ns, self._history.newest_ns
         self._accepted, self._refused_in_row = 1, 0
+        self._starts += 1
         self._now = x
 
     def _wait(self, time_ns: int) -> None:
@@ -392,6 +393,7 @@ class Estimator:
             nis_dof=self._nis_dof,
             rejected=self._rejected,
             ready=self._accepted >= READY_AFTER,
+            starts=self._starts,
         )
 
     def _process_noise(self) -> np.ndarray:

@@ -53,7 +53,7 @@ class TagOnlyEstimator:
         self._q_wb = np.array([1.0, 0.0, 0.0, 0.0])
         self._rate_b = np.zeros(3)
         self._accepted = 0
-        self._rejected = self._refused_in_row = 0
+        self._rejected = self._refused_in_row = self._starts = 0
         self._last_tag_ns = NEVER_NS
 
     def retune(self, parameters: Estimation) -> None:
@@ -121,9 +121,11 @@ class TagOnlyEstimator:
             nis_dof=0,
             rejected=self._rejected,
             ready=self._accepted >= READY_AFTER,
+            starts=self._starts,
         )
 
     def _start(self, p_wb: np.ndarray, q_wb: np.ndarray, capture_ns: int) -> None:
+        self._starts += 1
         self._pv_w, self._q_wb, self._rate_b = np.concatenate([p_wb, np.zeros(3)]), q_wb, np.zeros(3)
         self._pv_covariance, self._turn_covariance = np.eye(6), np.eye(6)
         self._accepted, self._refused_in_row = 1, 0

@@ -274,6 +274,8 @@ class Estimate(NamedTuple):
     """Number of tag observations rejected by the gate so far."""
     ready: bool
     """Whether an attitude has been found: by tags, or by gravity before the first tag."""
+    starts: int = 0
+    """How often it started: from the first pose, and anew where tags contradicted it, so that the pose jumped."""
 
     @property
     def placed(self) -> bool:

@@ -10,7 +10,6 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.estimator import ADRIFT_NS
 from firmware_py.core.failsafes import Level
 from firmware_py.core.rotations import rotate_back
 from firmware_py.core.transitions import State
@@ -172,5 +171,5 @@ class Picture:
 
 
 def _goes_on(before: Estimate, now: Estimate) -> bool:
-    """Whether a ready estimate continues that of the tick before. One that was adrift does not: the first tags relocate it."""
-    return before.ready and not before.tag_age_ns > ADRIFT_NS >= now.tag_age_ns
+    """Whether a ready estimate continues that of the tick before."""
+    return before.ready and before.starts == now.starts

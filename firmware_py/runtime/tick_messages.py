@@ -71,6 +71,7 @@ def body_signals(thrusters: int) -> tuple[Signal, ...]:
         Signal("nis_dof", kind="int"),
         Signal("rejected", kind="int"),
         Signal("ready", kind="bool"),
+        Signal("starts", kind="int"),
         Signal("setpoint_p_wb", 3, "m"),
         Signal("setpoint_q_wb", 4),
         Signal("setpoint_v_w", 3, "m/s"),

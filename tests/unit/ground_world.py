@@ -56,7 +56,7 @@ class Robot:
         self.off_plan = np.zeros(3)
         """How far from its place in a plan the robot is held, m."""
         self.nu = np.array([0.05, 0.0, -0.02, 0.01, 0.02, 0.03])
-        self.tag_age_ns, self.ready, self.may_arm, self.level = 30_000_000, True, True, Level.NONE
+        self.tag_age_ns, self.ready, self.starts, self.may_arm, self.level = 30_000_000, True, 1, True, Level.NONE
         self.refuse: dict[Action, str] = {}
         """Reason for each action that is refused."""
         self.asked: list[Request] = []
@@ -120,7 +120,7 @@ class Robot:
     def _record(self, body: int) -> BodyRecord:
         estimate = Estimate(
             self.p_wb[body], self.q_wb[body], self.nu, ZERO, ZERO, np.full(3, 0.002), np.full(3, 0.004),
-            self.tag_age_ns, float("nan"), 0, 0, self.ready,
+            self.tag_age_ns, float("nan"), 0, 0, self.ready, self.starts,
         )  # fmt: skip
         setpoint = Setpoint(self.p_wb[body], self.q_wb[body], ZERO, ZERO, ZERO, ZERO)
         thrust = Thrust(np.zeros(8), np.zeros(6), (1.0, 1.0), 0.75)

@@ -6,7 +6,7 @@ import pytest
 from firmware_py.core.body import Body
 from firmware_py.core.faults import STALLED, WHY, FaultDetector
 from firmware_py.core.thruster_names import Place, listed, name_of, places_of
-from firmware_py.core.types import EscFeedback, Event, ModuleInputs
+from firmware_py.core.types import EscFeedback, Event
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -35,9 +35,9 @@ def test_fault_names_the_module_and_the_thruster_there(pair: Body) -> None:
     said = [words.partition(":")[0] for words in detector.words]
     assert said == ["thruster 4 of module 2 stands still", "thruster 4 of module 2 is used again"]
     detector.words.clear()
-    turning = ModuleInputs(esc=[EscFeedback(2, (0.0, 2000.0), (0.5, 0.5), (0, 0))])
+    turning = EscFeedback(2, (0.0, 2000.0), (0.5, 0.5), (0, 0))
     for _ in range(10):
-        detector._judge_at_rest([ModuleInputs(), turning], np.zeros(16))
+        detector._judge_at_rest([[], [turning]], np.zeros(16))
     assert detector.words == ["thruster 4 of module 2 turns though it was told to stand still"]
 
 
