@@ -260,7 +260,10 @@ class Estimator:
 
     def _relocate(self, pose: BodyPose) -> None:
         """Relocates a body that was adrift once enough tags agree (`TagAgreement`); the state entries KEPT_STATES stay."""
-        if self._contradicts_gravity(pose) or not self._agrees(pose):
+        if self._contradicts_gravity(pose):
+            self._rejected += 1
+            return
+        if not self._agrees(pose):
             self._refuse(pose)
             return
         self._refused_in_row = 0

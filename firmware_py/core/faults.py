@@ -59,8 +59,8 @@ BELIEVED_NS = 500_000_000
 """How long believed forces are kept: the feedback of a module whose answers come late is compared with those of its own time. Against the
 present ones, propellers that reverse seemed to disobey where frames were 30 ms late each way."""
 FEEDBACK_WEIGHT = 0.3
-"""Weight of one ESC feedback in the running share of force that a thruster reports. Ten are judged per second, which gives a memory of
-0.3 s: less than the half second of motion that core.missing_thrust judges."""
+"""Weight of one ESC feedback in the running share of force that a thruster reports. Ten to thirteen are judged per second (`REPORT_NS`),
+which gives a memory of 0.3 s: less than the half second of motion that core.missing_thrust judges."""
 
 
 class ThrusterFaults(NamedTuple):
@@ -217,9 +217,9 @@ class FaultDetector:
         self._ticks += 1
         due: list[list[EscFeedback]] = [[] for _ in modules]
         for i, module in enumerate(modules):
-            for first, esc in {esc.first: esc for esc in module.esc}.items():
-                if self._next_report.get((i, first), 0) <= self._ticks:
-                    self._next_report[i, first] = self._ticks + self._report_ticks
+            for esc in reversed(module.esc):
+                if self._next_report.get((i, esc.first), 0) <= self._ticks:
+                    self._next_report[i, esc.first] = self._ticks + self._report_ticks
                     due[i].append(esc)
         return due
 

@@ -209,7 +209,8 @@ class HealthMonitor:
                 self._heard_ns[index] = now
             if module.mcu_state is not None:
                 self._unfit[index] = module.mcu_state in MCU_UNFIT
-                self._late_ns[index] = self._late_ns[index] if module.answered else now
+                if not module.answered:
+                    self._late_ns[index] = now
             if self._heard_ns[index] == now and not self._unfit[index]:
                 self._hears_ns[index] = now
             for tag in module.tags:

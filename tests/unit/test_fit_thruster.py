@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy import constants
 
 from firmware_py.description.schema import DescriptionError, build, read_toml
 from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
@@ -14,8 +15,6 @@ tool = importlib.import_module("fit_thruster")
 LIKE = load_vehicle("modcube").curve
 POWERS = np.arange(1, 6)
 DATA = Path(__file__).parents[2] / "tools" / "data"
-KGF = 9.80665
-"""N."""
 
 
 def measured(noise_n: float = 0.0, voltage_v: float = 12.0, idle_w: float = 0.0) -> dict[str, np.ndarray]:
@@ -53,11 +52,11 @@ def test_thruster_measured_at_16_volts_has_the_maker_s_force_and_power_at_12() -
     """T200: forward 3.71 kgf and 203 W, reverse 2.90 kgf and 204 W at 12 V (maker's table)."""
     rows = np.genfromtxt(DATA / "t200_16v.csv", delimiter=",", names=True)
     u, volts = (rows["pwm_us"] - 1500.0) / 400.0, np.full(len(rows), 16.0)
-    points = {"command": u, "force_n": KGF * rows["force_kgf"], "voltage_v": volts, "power_w": rows["power_w"]}
+    points = {"command": u, "force_n": constants.kgf * rows["force_kgf"], "voltage_v": volts, "power_w": rows["power_w"]}
     curve, _ = tool.fit_curve(points, LIKE, 12.0, 0.05)
     for name, kgf, watts in (("forward", 3.71, 203.0), ("reverse", 2.90, 204.0)):
         full_n = float(getattr(curve, name).sum())
-        assert full_n == pytest.approx(KGF * kgf, rel=0.03)
+        assert full_n == pytest.approx(constants.kgf * kgf, rel=0.03)
         assert full_n**POWERS @ getattr(curve, f"power_{name}") == pytest.approx(watts, rel=0.08)
 
 

@@ -46,7 +46,7 @@ def test_force_that_is_lost_whole_costs_no_moment(name: str, offset_m: float) ->
     detector = FaultDetector(body, Faults(), TICK_NS)
     failed = [EscFeedback(0, (0.0, 0.0), (0.0, 0.0), (1, 0)), EscFeedback(2, (0.0, 0.0), (0.0, 0.0), (0, 1))]
     nowhere = Estimate(ZERO, from_euler(0.0, 0.0, 0.0), np.zeros(6), ZERO, ZERO, ZERO, ZERO, 0, 1.0, 6, 0, False)
-    for _ in range(10 * Faults().dead_count):  # of these, ten a second are judged
+    for _ in range(10 * Faults().dead_count):  # one in `REPORT_NS` is judged
         now = detector.step([ModuleInputs(esc=failed)], Measured(None, None, None, []), nowhere, np.zeros(8), np.zeros(8), True, True)
     assert now.dead == (0, 3) and now.lost_axes == 1
     wanted = np.array([2.0, 1.0, 0.5, 0.1, 0.05, -0.1])
