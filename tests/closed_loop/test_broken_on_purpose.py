@@ -23,7 +23,7 @@ from hil.scenario import Step, load_scenario
 from tests.closed_loop.broken_vehicles import failed, reversed_thruster, turned_tags
 from tests.closed_loop.flights import Corrupt, Fly, Rebuild, shortened
 
-HOVER_S = 20.0
+HOVER_S, SETTLE_S = 20.0, 5.0
 PROTECTED_FROM = 0x040
 """Lower ids carry no CRC (ESTOP, SYNC); HEARTBEAT is not sent here."""
 
@@ -39,14 +39,14 @@ def crc_off_by_one_bit(frame: Frame) -> Frame:
 def test_one_reversed_thruster_fails_the_flight(fly: Fly, rebuild: Rebuild, thruster: int) -> None:
     rebuild(lambda vehicle: reversed_thruster(vehicle, thruster))
     # the firmware detects the thruster and flies on without it, so only the check on warnings fails
-    assert "warnings" in failed(fly(shortened("hover", HOVER_S)))
+    assert "warnings" in failed(fly(shortened("hover", HOVER_S, SETTLE_S)))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_tag_glued_on_ten_degrees_askew_fails_the_flight(fly: Fly, rebuild: Rebuild, axis: int) -> None:
     rebuild(lambda vehicle: turned_tags(vehicle, axis))
-    assert not fly(shortened("spiral", HOVER_S)).passed
+    assert not fly(shortened("spiral", HOVER_S, SETTLE_S)).passed
 
 
 @pytest.mark.slow
@@ -71,7 +71,7 @@ def test_crc_off_by_one_bit_on_one_side_fails_the_flight(
     fly: Fly, corrupt: Corrupt, to_plant: bool
 ) -> None:
     corrupt(crc_off_by_one_bit, to_plant)
-    assert not fly(shortened("hover", HOVER_S)).passed
+    assert not fly(shortened("hover", HOVER_S, SETTLE_S)).passed
 
 
 @pytest.fixture
@@ -203,7 +203,7 @@ def test_folder_holds_one_flight(fly: Fly, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_the_same_hover_unbroken_passes(fly: Fly) -> None:
-    assert fly(shortened("hover", HOVER_S)).passed
+    assert fly(shortened("hover", HOVER_S, SETTLE_S)).passed
 
 
 def test_fault_after_the_early_end_of_the_steps_is_told(fly: Fly, capsys: pytest.CaptureFixture[str]) -> None:

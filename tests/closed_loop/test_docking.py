@@ -2,11 +2,13 @@
 
 import dataclasses
 from pathlib import Path
+from typing import NamedTuple
 
 import near_miss
 import numpy as np
 import pytest
 
+from firmware_py.app.replay import replay
 from firmware_py.core.rotations import difference
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Mode
@@ -14,6 +16,8 @@ from firmware_py.description.parameters import PAPER, Parameters
 from firmware_py.description.signals import read_signals
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.prepare.assembly import PITCH_M
+from hil.checks import Result
+from hil.flight import fly_and_judge
 from hil.plant.fault_spec import Fault
 from hil.scenario import Step, load_scenario
 from tests.closed_loop.flights import Fly
@@ -22,10 +26,22 @@ LARGEST_JUMP_N = 1.0
 """Largest step of a thruster's command in the tick in which two bodies become one."""
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["dock-undock-dock", "dock-third", "dock-vertical", "dock-moving"])
-def test_modules_dock_and_no_command_jumps(fly: Fly, name: str) -> None:
-    metrics = fly(load_scenario(name), 3).metrics
+class Flown(NamedTuple):
+    """A flight that several tests look at: its result and the folder of its logs."""
+
+    result: Result
+    folder: Path
+
+
+@pytest.fixture(scope="module")
+def twice(tmp_path_factory: pytest.TempPathFactory) -> Flown:
+    """Two modules dock, undock, and dock again."""
+    folder = tmp_path_factory.mktemp("twice")
+    return Flown(fly_and_judge(load_scenario("dock-undock-dock"), 1, Parameters(), folder, "virtual:twice"), folder)
+
+
+def assert_docked_gently(result: Result) -> None:
+    metrics = result.metrics
     assert metrics["docked"] == 1.0
     assert metrics["tries"] >= 1.0
     assert metrics["false_declarations"] == 0.0
@@ -33,13 +49,31 @@ def test_modules_dock_and_no_command_jumps(fly: Fly, name: str) -> None:
 
 
 @pytest.mark.slow
-def test_both_pieces_know_where_they_are_from_the_first_pictures_after_an_undock(fly: Fly, tmp_path: Path) -> None:
+@pytest.mark.parametrize("name", ["dock-third", "dock-vertical", "dock-moving"])
+def test_modules_dock_and_no_command_jumps(fly: Fly, name: str) -> None:
+    assert_docked_gently(fly(load_scenario(name), 3))
+
+
+@pytest.mark.slow
+def test_modules_dock_undock_and_dock_again_and_no_command_jumps(twice: Flown) -> None:
+    assert_docked_gently(twice.result)
+    assert twice.result.warnings == ()
+
+
+@pytest.mark.slow
+def test_dock_of_two_modules_is_replayed_to_the_byte(twice: Flown) -> None:
+    outcome = replay(twice.folder)
+    assert outcome.first is None
+    assert outcome.ticks > 2000
+
+
+@pytest.mark.slow
+def test_both_pieces_know_where_they_are_from_the_first_pictures_after_an_undock(twice: Flown) -> None:
     """By then the magnets have pushed them apart for most of a second, while the firmware still took them for one body. One swings back
     towards the other, which is no collision.
     """
-    assert fly(load_scenario("dock-undock-dock"), 1).warnings == ()
-    believed = read_signals(tmp_path / "run" / "signals.mcap")
-    truth = read_signals(tmp_path / "run" / "truth.mcap")
+    believed = read_signals(twice.folder / "signals.mcap")
+    truth = read_signals(twice.folder / "truth.mcap")
     times = believed["/firmware/body1"]["time_ns"]
     parted_ns = times[np.flatnonzero(np.diff(times) > 5e8)[0] + 1]
     for number in range(2):
@@ -53,10 +87,9 @@ def test_both_pieces_know_where_they_are_from_the_first_pictures_after_an_undock
 
 
 @pytest.mark.slow
-def test_pair_that_docked_twice_is_to_hold_the_attitude_of_before(fly: Fly, tmp_path: Path) -> None:
+def test_pair_that_docked_twice_is_to_hold_the_attitude_of_before(twice: Flown) -> None:
     """Regression: each dock and undock kept the attitude of its moment. After six of them one module leant over by ten degrees."""
-    fly(load_scenario("dock-undock-dock"), 1)
-    believed = read_signals(tmp_path / "run" / "signals.mcap")
+    believed = read_signals(twice.folder / "signals.mcap")
     target, other = believed["/firmware/body0"], believed["/firmware/body1"]
     docked_ns = other["time_ns"][np.flatnonzero(np.diff(other["time_ns"]) > 5e8)[0]]
     before = target["setpoint_q_wb"][np.searchsorted(target["time_ns"], docked_ns)]

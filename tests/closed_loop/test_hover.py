@@ -46,7 +46,7 @@ def test_estimate_of_a_hovering_module_is_as_good_as_it_says(fly: Fly) -> None:
 def errors_in_sigmas(folder: Path, seed: int, rate_hz: int) -> np.ndarray:
     """(k, 6) errors of the estimated pose in a settled hover, in the estimator's own sigmas."""
     folder.mkdir()
-    scenario = shortened("hover", 10.0)
+    scenario = shortened("hover", 10.0, settle_s=5.0)
     fly_scenario(scenario, seed, Parameters(), folder, f"virtual:{folder.name}", rate_hz)
     flight = read_flight(folder)
     error = np.hstack([flight.firmware["p_wb"] - flight.p_wb, rotation_vectors(flight.firmware["q_wb"], flight.q_wb)])

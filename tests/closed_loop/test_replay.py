@@ -20,7 +20,6 @@ from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
 from firmware_py.runtime.tick_messages import TICK_SIGNALS
 from firmware_py.runtime.tick_messages import TICKS as TICKS_TOPIC
 from hil.plant.fault_spec import Fault
-from hil.scenario import load_scenario
 from tests.closed_loop.flights import Fly, shortened
 
 TICKS = 500
@@ -84,14 +83,6 @@ def test_killed_process_goes_on_as_another_one(fly: Fly, tmp_path: Path) -> None
     fly(scenario)
     outcome = replay(tmp_path / "run")
     assert (outcome.first, outcome.ticks) == (None, 550)
-
-
-@pytest.mark.slow
-def test_dock_of_two_modules_comes_out_to_the_byte(fly: Fly, tmp_path: Path) -> None:
-    fly(load_scenario("dock-undock-dock"))
-    outcome = replay(tmp_path / "run")
-    assert outcome.first is None
-    assert outcome.ticks > 2000
 
 
 def test_limiter_that_was_changed_is_named(flown: Path, monkeypatch: pytest.MonkeyPatch) -> None:
