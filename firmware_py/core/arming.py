@@ -74,11 +74,15 @@ def _pose_sure(q: Question) -> str:
     return f"pose sigma {sigma * 1e3:.0f} mm, {permitted * 1e3:.0f} permitted" if _has_pose(q) and not sure else ""
 
 
-def _pose_consistent(q: Question) -> str:
-    permitted, ratio = q.parameters.failsafes.estimator_limit, q.health.nis_ratio
-    if Need.POSITION in MODES[q.mode].needs and not ratio <= permitted:
-        return f"sensors and model disagree: {ratio:.1f} of the expected, {permitted:.1f} permitted"
-    return ""
+def _pose_consistent(q: Question) -> list[str]:
+    limits, health, reasons = q.parameters.failsafes, q.health, list[str]()
+    if Need.POSITION not in MODES[q.mode].needs:
+        return reasons
+    if not health.nis_ratio <= limits.estimator_limit:
+        reasons.append(f"sensors and model disagree: {health.nis_ratio:.1f} of the expected, {limits.estimator_limit:.1f} permitted")
+    if health.rejected_share > limits.rejected_limit:
+        reasons.append(f"tags refused: {health.rejected_share:.0%} of them, {limits.rejected_limit:.0%} permitted")
+    return reasons
 
 
 def _sticks(q: Question) -> str:

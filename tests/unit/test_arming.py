@@ -59,6 +59,7 @@ SOFT: list[tuple[Health, str]] = [
     (GOOD._replace(battery_age_s=NEVER_S), "battery was not heard of lately"),
     (GOOD._replace(cabin_age_s=NEVER_S), "cabin was not heard of lately"),
     (GOOD._replace(nis_ratio=6.0), "sensors and model disagree: 6.0 of the expected, 5.0 permitted"),
+    (GOOD._replace(rejected_share=0.91), "tags refused: 91% of them, 80% permitted"),
     (GOOD._replace(unfit=(0, 2)), "module 0, 2 starts, hears no commands, or has a fault"),
     (GOOD._replace(esc_missing=(Place(0, 0), Place(0, 7))), "ESC 1, 8 of module 0 does not answer"),
     (GOOD._replace(esc_unknown=(Place(2, 6), Place(2, 7))), "ESC 7, 8 of module 2 answers, but the vehicle file has no thruster there"),
@@ -126,7 +127,9 @@ def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
     assert reasons(both) == ["module 2 does not answer", "pose is 700 ms old, 500 permitted"]
 
 
-BOUNDARIES = [("tag_age_s", 0.5), ("sigma_m", 0.05), ("nis_ratio", 5.0), ("frame_errors_per_s", 20.0), ("cabin_age_s", 2.0)]
+BOUNDARIES = [
+    ("tag_age_s", 0.5), ("sigma_m", 0.05), ("nis_ratio", 5.0), ("rejected_share", 0.8), ("frame_errors_per_s", 20.0), ("cabin_age_s", 2.0),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("field", "limit"), BOUNDARIES)
