@@ -29,7 +29,7 @@ class Control:
         1.16, low=0.1, high=5, help="damping ratio of the position loop", mavlink="POS_DAMP"
     )
     attitude_bandwidth: float = quantity(
-        2.5, unit="rad/s", low=0.1, high=20, help="bandwidth of the attitude loop", mavlink="ATT_BW"
+        2.5, unit="rad/s", low=0.1, high=12, help="bandwidth of the attitude loop", mavlink="ATT_BW"
     )
     attitude_damping: float = quantity(
         1.18, low=0.1, high=5, help="damping ratio of the attitude loop", mavlink="ATT_DAMP"
@@ -392,12 +392,23 @@ def invalid(parameters: Parameters) -> list[str]:
     return reasons
 
 
+LEAST_DAMPING_S, MOST_RATE_GAIN = 0.06, 50.0
+"""Damping ratio over bandwidth, s, below which lag makes a loop swing, and rate gain, 2 * damping * bandwidth, 1/s, above which it does, as
+measured in a hover: a damping of 0.3 swings at 7 rad/s and holds at 5, that of 0.5 swings at 10 and holds at 8; rate gains of 70 swing."""
+
+
 def contradictions(parameters: Parameters) -> list[str]:
     """Reports, in words, parameters that are in range one by one but not together; empty if there are none."""
-    fence = parameters.fence
-    if fence.top_m < fence.bottom_m:
-        return []
-    return [f"fence.top_m is {fence.top_m:g}, fence.bottom_m {fence.bottom_m:g}: the top must be at less depth"]
+    fence, control, reasons = parameters.fence, parameters.control, []
+    if fence.top_m >= fence.bottom_m:
+        reasons.append(f"fence.top_m is {fence.top_m:g}, fence.bottom_m {fence.bottom_m:g}: the top must be at less depth")
+    for loop in ("position", "attitude"):
+        bandwidth, damping = getattr(control, f"{loop}_bandwidth"), getattr(control, f"{loop}_damping")
+        low, high = LEAST_DAMPING_S * bandwidth, MOST_RATE_GAIN / (2.0 * bandwidth)
+        if not low <= damping <= high:
+            words = f"control.{loop}_damping is {damping:g}, control.{loop}_bandwidth {bandwidth:g}: the {loop} loop would swing"
+            reasons.append(f"{words}; damping permitted at this bandwidth: {low:.2g} to {high:.2g}")
+    return reasons
 
 
 def changed(parameters: Parameters, dotted: str, value: float | str, is_armed: bool) -> Parameters:

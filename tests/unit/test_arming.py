@@ -114,6 +114,18 @@ def test_robot_whose_fence_is_upside_down_is_never_armed() -> None:
         assert reasons(parameters=replace(P, fence=Fence(top_m=49.9)), forced=forced) == []
 
 
+@pytest.mark.parametrize("loop", ["position", "attitude"])
+@pytest.mark.parametrize(("bandwidth", "damping", "holds"), [
+    (2.5, 0.14, False), (2.5, 0.16, True), (8.0, 0.3, False), (8.0, 0.5, True), (8.0, 3.1, True), (8.0, 5.0, False), (5.0, 5.0, True),
+])  # fmt: skip
+def test_robot_whose_loop_would_swing_is_never_armed(loop: str, bandwidth: float, damping: float, holds: bool) -> None:
+    """Flown: 8 rad/s swings at damping ratios of 0.3 and 5, and holds at 0.5 and 3."""
+    swinging = P.replace(f"control.{loop}_bandwidth", bandwidth).replace(f"control.{loop}_damping", damping)
+    for forced in (False, True):
+        found = reasons(parameters=swinging, forced=forced)
+        assert len(found) == (not holds) and all(words.startswith(f"control.{loop}_damping is {damping:g}") for words in found)
+
+
 def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
     assert [check.name for check in CHECKS if not check.may_be_skipped] == [
         "e-stop clear", "modules answer", "mode has what it needs", "sticks neutral", "parameters valid", "compiled code warm",
