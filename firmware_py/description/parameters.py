@@ -54,15 +54,15 @@ class Estimation:
         "full", choices=("full", "paper"), help="full: tags, IMU and depth, with disturbance estimate; paper: tags alone"
     )
     tag_sigma_m: float = quantity(
-        0.0021, unit="m", low=1e-5, high=1,
+        0.0021, unit="m", low=5e-4, high=1,  # figures far below the true noise make the estimator refuse tags
         help="horizontal tag position noise: across the axis of a camera that looks down", mavlink="TAG_POS_SD"
     )
     tag_sigma_axis_m: float = quantity(
-        0.0042, unit="m", low=1e-5, high=1,
+        0.0042, unit="m", low=5e-4, high=1,
         help="vertical tag position noise: along the axis of a camera that looks down", mavlink="TAG_AXIS_SD"
     )
     tag_sigma_rad: float = quantity(
-        0.0096, unit="rad", low=1e-5, high=1, help="tag attitude noise, each axis", mavlink="TAG_ATT_SD"
+        0.0096, unit="rad", low=2e-3, high=1, help="tag attitude noise, each axis", mavlink="TAG_ATT_SD"
     )
     tag_gate: float = quantity(
         5.0, low=4, high=50,
@@ -87,7 +87,7 @@ class Estimation:
     accel_bias_walk: float = quantity(
         1e-4, unit="m/s^2/sqrt(s)", low=0, high=1, help="accelerometer bias random walk", mavlink="ACC_WALK"
     )
-    depth_sigma_m: float = quantity(0.003, unit="m", low=1e-5, high=1, help="depth noise per sample", mavlink="DEPTH_SD")
+    depth_sigma_m: float = quantity(0.003, unit="m", low=2e-4, high=1, help="depth noise per sample", mavlink="DEPTH_SD")
     depth_bias_walk: float = quantity(
         2e-4, unit="m/sqrt(s)", low=0, high=1, help="depth bias random walk", mavlink="DEPTH_WALK"
     )
@@ -151,7 +151,7 @@ class Limiter:
         1.0, low=0.05, high=1.0, help="share of each thruster's limit that may be used", mavlink="LIM_FORCE"
     )
     slew_n_per_s: float = quantity(
-        200.0, unit="N/s", low=1, high=1e4, help="slew rate limit of a thruster's force", mavlink="LIM_SLEW"
+        200.0, unit="N/s", low=10, high=1e4, help="slew rate limit of a thruster's force", mavlink="LIM_SLEW"
     )
     relay_on_s: float = quantity(
         60.0, unit="s", low=1, high=3600,
@@ -164,7 +164,7 @@ class Limiter:
         6.0,
         unit="W",
         low=0,
-        high=1000,
+        high=50,
         help="power of a docking magnet that is on, subtracted from the power available to thrusters",
         mavlink="LIM_MAG_W",
     )

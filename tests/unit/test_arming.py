@@ -103,7 +103,7 @@ def test_parameters_out_of_range_are_never_passed_over() -> None:
     for forced in (False, True):
         assert reasons(parameters=wrong, forced=forced) == [
             "parameter limiter.force_share: 1.5 is out of range; permitted: 0.05 to 1",
-            "parameter limiter.slew_n_per_s: 0.0 is out of range; permitted: 1 to 10000 N/s",
+            "parameter limiter.slew_n_per_s: 0.0 is out of range; permitted: 10 to 10000 N/s",
         ]
 
 

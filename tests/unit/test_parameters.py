@@ -32,6 +32,16 @@ def test_every_shipped_set_is_within_its_bounds(name: str) -> None:
         assert value in limits.choices if limits.choices else limits.low <= value <= limits.high
 
 
+@pytest.mark.parametrize(("name", "value"), [
+    ("control.attitude_bandwidth", 15.0), ("estimation.tag_sigma_m", 4e-4), ("estimation.tag_sigma_axis_m", 3e-4),
+    ("estimation.tag_sigma_rad", 1e-3), ("estimation.depth_sigma_m", 3e-5), ("limiter.slew_n_per_s", 3.0), ("limiter.relay_w", 130.0),
+])  # fmt: skip
+def test_value_with_which_a_flown_hover_was_lost_is_out_of_range(name: str, value: float) -> None:
+    """Flown with each alone: thrusters swing between their limits, the estimator refuses tags, or magnets leave no power."""
+    with pytest.raises(DescriptionError, match="out of range"):
+        Parameters().replace(name, value)
+
+
 def test_numbers_have_a_mavlink_name_each_of_their_own() -> None:
     """MAVLink names have at most 16 characters; words cannot be sent as a float and have none."""
     names = [limits.mavlink for limits in REGISTRY.values() if not limits.choices]
