@@ -399,7 +399,7 @@ measured in a hover: a damping of 0.3 swings at 7 rad/s and holds at 5, that of 
 
 def contradictions(parameters: Parameters) -> list[str]:
     """Reports, in words, parameters that are in range one by one but not together; empty if there are none."""
-    fence, control, reasons = parameters.fence, parameters.control, []
+    fence, control, docking, reasons = parameters.fence, parameters.control, parameters.docking, []
     if fence.top_m >= fence.bottom_m:
         reasons.append(f"fence.top_m is {fence.top_m:g}, fence.bottom_m {fence.bottom_m:g}: the top must be at less depth")
     for loop in ("position", "attitude"):
@@ -408,6 +408,10 @@ def contradictions(parameters: Parameters) -> list[str]:
         if not low <= damping <= high:
             words = f"control.{loop}_damping is {damping:g}, control.{loop}_bandwidth {bandwidth:g}: the {loop} loop would swing"
             reasons.append(f"{words}; damping permitted at this bandwidth: {low:.2g} to {high:.2g}")
+    threshold_ma, hysteresis_ma = docking.current_threshold_ma, docking.current_hysteresis_ma
+    if hysteresis_ma >= threshold_ma:
+        words = f"docking.current_hysteresis_ma is {hysteresis_ma:g}, docking.current_threshold_ma {threshold_ma:g}"
+        reasons.append(f"{words}: the hysteresis must be smaller, or no current would tell that a joint opens")
     return reasons
 
 

@@ -126,6 +126,15 @@ def test_robot_whose_loop_would_swing_is_never_armed(loop: str, bandwidth: float
         assert len(found) == (not holds) and all(words.startswith(f"control.{loop}_damping is {damping:g}") for words in found)
 
 
+def test_robot_that_could_not_notice_a_joint_without_current_is_never_armed() -> None:
+    words = "the hysteresis must be smaller, or no current would tell that a joint opens"
+    for threshold_ma, hysteresis_ma, holds in ((70.0, 70.0, False), (70.0, 69.0, True), (10.0, 15.0, False)):
+        deaf = replace(P, docking=replace(P.docking, current_threshold_ma=threshold_ma, current_hysteresis_ma=hysteresis_ma))
+        for forced in (False, True):
+            found = reasons(parameters=deaf, forced=forced)
+            assert len(found) == (not holds) and all(found_words.endswith(words) for found_words in found)
+
+
 def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
     assert [check.name for check in CHECKS if not check.may_be_skipped] == [
         "e-stop clear", "modules answer", "mode has what it needs", "sticks neutral", "parameters valid", "compiled code warm",
