@@ -51,14 +51,16 @@ class Estimation:
     """Measurement noise of the sensors, and process noise for what the model leaves out."""
 
     kind: str = quantity(
-        "full", choices=("full", "paper"), help="full: tags, IMU and depth, with disturbance estimate; paper: tags alone"
+        "full",
+        choices=("full", "paper"),
+        help="full: tags, IMU and depth, with disturbance estimate; paper: tags alone, too noisy for more than the paper's gains",
     )
     tag_sigma_m: float = quantity(
-        0.0021, unit="m", low=5e-4, high=1,  # figures far below the true noise make the estimator refuse tags
+        0.0021, unit="m", low=1e-3, high=1,  # figures far below the true noise make the estimator refuse tags
         help="horizontal tag position noise: across the axis of a camera that looks down", mavlink="TAG_POS_SD"
     )
     tag_sigma_axis_m: float = quantity(
-        0.0042, unit="m", low=5e-4, high=1,
+        0.0042, unit="m", low=1e-3, high=1,
         help="vertical tag position noise: along the axis of a camera that looks down", mavlink="TAG_AXIS_SD"
     )
     tag_sigma_rad: float = quantity(
@@ -395,6 +397,8 @@ def invalid(parameters: Parameters) -> list[str]:
 LEAST_DAMPING_S, MOST_RATE_GAIN = 0.06, 50.0
 """Damping ratio over bandwidth, s, below which lag makes a loop swing, and rate gain, 2 * damping * bandwidth, 1/s, above which it does, as
 measured in a hover: a damping of 0.3 swings at 7 rad/s and holds at 5, that of 0.5 swings at 10 and holds at 8; rate gains of 70 swing."""
+LEAST_SLEW_N = 5.0
+"""Slew rate over bandwidth, N, below which a body swings or tumbles: at 12 rad/s 40 N/s do, and 60 hold; at 10 rad/s 20 do, and 30 hold."""
 
 
 def contradictions(parameters: Parameters) -> list[str]:
@@ -408,6 +412,10 @@ def contradictions(parameters: Parameters) -> list[str]:
         if not low <= damping <= high:
             words = f"control.{loop}_damping is {damping:g}, control.{loop}_bandwidth {bandwidth:g}: the {loop} loop would swing"
             reasons.append(f"{words}; damping permitted at this bandwidth: {low:.2g} to {high:.2g}")
+    slew_n_per_s, fastest = parameters.limiter.slew_n_per_s, max(control.position_bandwidth, control.attitude_bandwidth)
+    if slew_n_per_s < LEAST_SLEW_N * fastest:
+        words = f"limiter.slew_n_per_s is {slew_n_per_s:g}, the larger bandwidth {fastest:g} rad/s: the body would swing or tumble"
+        reasons.append(f"{words}; at least {LEAST_SLEW_N * fastest:.3g} N/s permitted")
     threshold_ma, hysteresis_ma = docking.current_threshold_ma, docking.current_hysteresis_ma
     if hysteresis_ma >= threshold_ma:
         words = f"docking.current_hysteresis_ma is {hysteresis_ma:g}, docking.current_threshold_ma {threshold_ma:g}"

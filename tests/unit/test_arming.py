@@ -99,11 +99,11 @@ def test_active_fail_safe_hinders_arming_and_force_passes_over_it() -> None:
 
 
 def test_parameters_out_of_range_are_never_passed_over() -> None:
-    wrong = replace(P, limiter=replace(Limiter(), force_share=1.5, slew_n_per_s=0.0))
+    wrong = replace(P, limiter=replace(Limiter(), force_share=1.5, relay_on_s=0.0))
     for forced in (False, True):
         assert reasons(parameters=wrong, forced=forced) == [
             "parameter limiter.force_share: 1.5 is out of range; permitted: 0.05 to 1",
-            "parameter limiter.slew_n_per_s: 0.0 is out of range; permitted: 10 to 10000 N/s",
+            "parameter limiter.relay_on_s: 0.0 is out of range; permitted: 1 to 3600 s",
         ]
 
 
@@ -124,6 +124,16 @@ def test_robot_whose_loop_would_swing_is_never_armed(loop: str, bandwidth: float
     for forced in (False, True):
         found = reasons(parameters=swinging, forced=forced)
         assert len(found) == (not holds) and all(words.startswith(f"control.{loop}_damping is {damping:g}") for words in found)
+
+
+@pytest.mark.parametrize("loop", ["position", "attitude"])
+@pytest.mark.parametrize(("bandwidth", "slew", "holds"), [(10.0, 20.0, False), (10.0, 50.0, True), (5.0, 20.0, False), (5.0, 25.0, True)])
+def test_robot_whose_thrusters_are_slower_than_its_gains_is_never_armed(loop: str, bandwidth: float, slew: float, holds: bool) -> None:
+    """Flown: at 10 rad/s a hover is lost with 20 N/s and holds with 30."""
+    sluggish = replace(P, limiter=Limiter(slew_n_per_s=slew)).replace(f"control.{loop}_bandwidth", bandwidth)
+    for forced in (False, True):
+        found = reasons(parameters=sluggish, forced=forced)
+        assert len(found) == (not holds) and all(words.startswith(f"limiter.slew_n_per_s is {slew:g}") for words in found)
 
 
 def test_robot_that_could_not_notice_a_joint_without_current_is_never_armed() -> None:
