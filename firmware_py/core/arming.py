@@ -11,7 +11,8 @@ from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.thruster_names import listed
 from firmware_py.core.transitions import MODES, Need
 from firmware_py.core.types import Mode
-from firmware_py.description.parameters import Parameters, contradictions, invalid
+from firmware_py.description.parameter_rules import contradictions
+from firmware_py.description.parameters import Parameters, invalid
 
 
 class Question(NamedTuple):

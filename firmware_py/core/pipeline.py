@@ -47,7 +47,8 @@ from firmware_py.core.types import (
     Request,
     Thrust,
 )  # fmt: skip
-from firmware_py.description.parameters import Parameters, changed
+from firmware_py.description.parameter_rules import changed
+from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 
 ESTIMATORS: dict[str, type[Estimator] | type[TagOnlyEstimator]] = {"full": Estimator, "paper": TagOnlyEstimator}

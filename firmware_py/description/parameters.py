@@ -56,15 +56,15 @@ class Estimation:
         help="full: tags, IMU and depth, with disturbance estimate; paper: tags alone, too noisy for more than the paper's gains",
     )
     tag_sigma_m: float = quantity(
-        0.0021, unit="m", low=1e-3, high=1,  # figures far below the true noise make the estimator refuse tags
+        0.0021, unit="m", low=1e-4, high=1,
         help="horizontal tag position noise: across the axis of a camera that looks down", mavlink="TAG_POS_SD"
     )
     tag_sigma_axis_m: float = quantity(
-        0.0042, unit="m", low=1e-3, high=1,
+        0.0042, unit="m", low=1e-4, high=1,
         help="vertical tag position noise: along the axis of a camera that looks down", mavlink="TAG_AXIS_SD"
     )
     tag_sigma_rad: float = quantity(
-        0.0096, unit="rad", low=2e-3, high=1, help="tag attitude noise, each axis", mavlink="TAG_ATT_SD"
+        0.0096, unit="rad", low=5e-4, high=1, help="tag attitude noise, each axis", mavlink="TAG_ATT_SD"
     )
     tag_gate: float = quantity(
         5.0, low=4, high=50,
@@ -392,45 +392,6 @@ def invalid(parameters: Parameters) -> list[str]:
         if not limits.permits(value):
             reasons.append(f"parameter {group}.{name}: {value!r} is out of range; permitted: {describe(limits)}")
     return reasons
-
-
-LEAST_DAMPING_S, MOST_RATE_GAIN = 0.06, 50.0
-"""Damping ratio over bandwidth, s, below which lag makes a loop swing, and rate gain, 2 * damping * bandwidth, 1/s, above which it does, as
-measured in a hover: a damping of 0.3 swings at 7 rad/s and holds at 5, that of 0.5 swings at 10 and holds at 8; rate gains of 70 swing."""
-LEAST_SLEW_N = 5.0
-"""Slew rate over bandwidth, N, below which a body swings or tumbles: at 12 rad/s 40 N/s do, and 60 hold; at 10 rad/s 20 do, and 30 hold."""
-
-
-def contradictions(parameters: Parameters) -> list[str]:
-    """Reports, in words, parameters that are in range one by one but not together; empty if there are none."""
-    fence, control, docking, reasons = parameters.fence, parameters.control, parameters.docking, []
-    if fence.top_m >= fence.bottom_m:
-        reasons.append(f"fence.top_m is {fence.top_m:g}, fence.bottom_m {fence.bottom_m:g}: the top must be at less depth")
-    for loop in ("position", "attitude"):
-        bandwidth, damping = getattr(control, f"{loop}_bandwidth"), getattr(control, f"{loop}_damping")
-        low, high = LEAST_DAMPING_S * bandwidth, MOST_RATE_GAIN / (2.0 * bandwidth)
-        if not low <= damping <= high:
-            words = f"control.{loop}_damping is {damping:g}, control.{loop}_bandwidth {bandwidth:g}: the {loop} loop would swing"
-            reasons.append(f"{words}; damping permitted at this bandwidth: {low:.2g} to {high:.2g}")
-    slew_n_per_s, fastest = parameters.limiter.slew_n_per_s, max(control.position_bandwidth, control.attitude_bandwidth)
-    if slew_n_per_s < LEAST_SLEW_N * fastest:
-        words = f"limiter.slew_n_per_s is {slew_n_per_s:g}, the larger bandwidth {fastest:g} rad/s: the body would swing or tumble"
-        reasons.append(f"{words}; at least {LEAST_SLEW_N * fastest:.3g} N/s permitted")
-    threshold_ma, hysteresis_ma = docking.current_threshold_ma, docking.current_hysteresis_ma
-    if hysteresis_ma >= threshold_ma:
-        words = f"docking.current_hysteresis_ma is {hysteresis_ma:g}, docking.current_threshold_ma {threshold_ma:g}"
-        reasons.append(f"{words}: the hysteresis must be smaller, or no current would tell that a joint opens")
-    return reasons
-
-
-def changed(parameters: Parameters, dotted: str, value: float | str, is_armed: bool) -> Parameters:
-    """Returns a copy with `group.field` set. Raises DescriptionError as `Parameters.replace` does, and in flight (`is_armed`) if the copy
-    would contradict itself.
-    """
-    after = parameters.replace(dotted, value)
-    if is_armed and (reasons := contradictions(after)):
-        raise DescriptionError(f"parameter {dotted} stays while a vehicle is armed: {'; '.join(reasons)}")
-    return after
 
 
 def load_parameters(path: Path) -> Parameters:

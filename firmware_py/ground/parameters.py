@@ -14,7 +14,8 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.core.types import WARNING, Action
-from firmware_py.description.parameters import Parameters, changed, registry
+from firmware_py.description.parameter_rules import changed
+from firmware_py.description.parameters import Parameters, registry
 from firmware_py.description.schema import DescriptionError, Limits
 from firmware_py.ground.stored_parameters import differences_toml, with_stored_values
 from firmware_py.ground.system import Arrival, Handler, System

@@ -33,8 +33,8 @@ def test_every_shipped_set_is_within_its_bounds(name: str) -> None:
 
 
 @pytest.mark.parametrize(("name", "value"), [
-    ("control.attitude_bandwidth", 15.0), ("estimation.tag_sigma_m", 5e-4), ("estimation.tag_sigma_axis_m", 3e-4),
-    ("estimation.tag_sigma_rad", 1e-3), ("estimation.depth_sigma_m", 3e-5), ("limiter.slew_n_per_s", 3.0), ("limiter.relay_w", 130.0),
+    ("control.attitude_bandwidth", 15.0), ("estimation.tag_sigma_m", 1e-5), ("estimation.tag_sigma_axis_m", 1e-5),
+    ("estimation.tag_sigma_rad", 1e-5), ("estimation.depth_sigma_m", 3e-5), ("limiter.slew_n_per_s", 3.0), ("limiter.relay_w", 130.0),
 ])  # fmt: skip
 def test_value_with_which_a_flown_hover_was_lost_is_out_of_range(name: str, value: float) -> None:
     """Flown with each alone: thrusters swing between their limits, the estimator refuses tags, or magnets leave no power."""
