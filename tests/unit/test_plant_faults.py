@@ -10,7 +10,7 @@ from firmware_py.bus.codec import Frame, Receiver
 from firmware_py.description.schema import DescriptionError
 from hil.faults import Faults, Wire
 from hil.nodes import Nodes, make_nodes
-from hil.plant.fault_spec import Fault
+from hil.plant.fault_spec import THRUSTER_KINDS, Fault
 from hil.scenario import load_scenario, make_world
 from tests.unit.mcu_frames import ARMED, CODEC, sync, thrust
 
@@ -48,6 +48,14 @@ def test_broken_thruster_gives_that_share_of_its_force(kind: str, value: float, 
     good, bad = healthy.world.truth(0).force_n, broken.world.truth(0).force_n
     assert bad[3] / good[3] == pytest.approx(expected, abs=0.06)
     np.testing.assert_allclose(np.delete(bad, 3), np.delete(good, 3), rtol=0.05)
+
+
+@pytest.mark.parametrize("kind", THRUSTER_KINDS)
+def test_every_kind_of_broken_thruster_pushes_otherwise_than_a_healthy_one(kind: str) -> None:
+    healthy, broken = nodes_with(), nodes_with(Fault(kind=kind, module=1, index=3))
+    for nodes in (healthy, broken):
+        fly(nodes, 10)
+    assert broken.world.truth(0).force_n[3] != healthy.world.truth(0).force_n[3]
 
 
 def test_lying_thruster_reports_the_speed_of_a_healthy_one() -> None:
