@@ -17,6 +17,8 @@ from firmware_py.core.rotations import V, cross, difference, rotate, rotate_back
 from firmware_py.core.types import Estimate, Setpoint
 from firmware_py.description.parameters import Control
 
+LAWS = {"model": True, "paper": False}
+"""By control law: whether C and D are those of the wanted motion, and g is counteracted; else C and D are those of the present one."""
 SETPOINT = f"{V},{V},{V},{V},{V},{V}"
 """Types of a Setpoint's fields."""
 
@@ -31,7 +33,7 @@ class Controller:
         self._kd = np.repeat(
             [2 * p.position_damping * p.position_bandwidth, 2 * p.attitude_damping * p.attitude_bandwidth], 3
         )
-        self._law = p.law == "model", p.drag_feedforward, p.disturbance_feedforward
+        self._law = LAWS[p.law], p.drag_feedforward, p.disturbance_feedforward
 
     def step(self, now: Setpoint, ahead: Setpoint, estimate: Estimate) -> np.ndarray:
         """Returns the wanted wrench, (6,), body frame.

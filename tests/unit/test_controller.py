@@ -9,12 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.core import propagation
 from firmware_py.core.body import Body
-from firmware_py.core.controller import Controller
+from firmware_py.core.controller import LAWS, Controller
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import difference, exp, from_euler, multiply, rotate
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.types import Estimate, Setpoint
 from firmware_py.description.parameters import Control
+from firmware_py.description.schema import limits_of
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
@@ -73,6 +74,11 @@ def surprise(body: Body, parameters: Control, q_wb: np.ndarray) -> float:
 
 
 @pytest.mark.parametrize("q_wb", ATTITUDES.values(), ids=ATTITUDES.keys())
+def test_every_law_that_may_be_chosen_is_known_to_the_controller() -> None:
+    """Regression: any other choice flew as the paper's."""
+    assert set(limits_of(Control, "law").choices) == set(LAWS)
+
+
 @pytest.mark.parametrize("law", ["model", "paper"])
 def test_robot_on_its_path_accelerates_as_the_path_does(body: Body, law: str, q_wb: np.ndarray) -> None:
     if law == "paper":  # the paper's g(eta) is zero by design of its robot
