@@ -56,7 +56,7 @@ class Estimation:
         help="full: tags, IMU and depth, with disturbance estimate; paper: tags alone, too noisy for more than the paper's gains",
     )
     tag_sigma_m: float = quantity(
-        0.0021, unit="m", low=1e-4, high=1,
+        0.0021, unit="m", low=1e-4, high=1,  # 0.1 mm: motion capture
         help="horizontal tag position noise: across the axis of a camera that looks down", mavlink="TAG_POS_SD"
     )
     tag_sigma_axis_m: float = quantity(

@@ -37,7 +37,7 @@ def test_random_shape_of_modules_flies_a_closed_curve(fly: Fly) -> None:
 @pytest.mark.slow
 def test_force_of_two_docked_modules_is_tracked_as_well_as_that_of_one_without_interference(fly: Fly) -> None:
     scenario = shortened("force-tracking", 40.0)
-    half = tuple(dataclasses.replace(jets, until_s=scenario.task.settle_s + 20.0) for jets in scenario.fault)
+    half = tuple(dataclasses.replace(jets, until_s=scenario.task.settle_s + 0.5 * scenario.task.duration_s) for jets in scenario.fault)
     result = fly(dataclasses.replace(scenario, fault=half), 0)
     assert result.passed
     assert set(result.metrics) - set(SHOWN) == set(force_names([1, 2]))

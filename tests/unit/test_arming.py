@@ -142,7 +142,7 @@ def test_robot_that_could_not_notice_a_joint_without_current_is_never_armed() ->
         deaf = replace(P, docking=replace(P.docking, current_threshold_ma=threshold_ma, current_hysteresis_ma=hysteresis_ma))
         for forced in (False, True):
             found = reasons(parameters=deaf, forced=forced)
-            assert len(found) == (not holds) and all(found_words.endswith(words) for found_words in found)
+            assert len(found) == (not holds) and all(reason.endswith(words) for reason in found)
 
 
 def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
