@@ -160,7 +160,9 @@ class Limiter:
         help="longest time that a cold docking magnet may stay on; without effect while relay_duty is 1", mavlink="LIM_MAG_ON"
     )
     relay_duty: float = quantity(
-        1.0, low=0.01, high=1, help="largest long-term duty cycle of a docking magnet", mavlink="LIM_MAG_DUTY"
+        1.0, low=0.01, high=1,
+        help="largest long-term duty cycle of a docking magnet; below 1, docked modules come apart after relay_on_s / (1 - relay_duty)",
+        mavlink="LIM_MAG_DUTY"
     )
     relay_w: float = quantity(
         6.0,

@@ -116,7 +116,8 @@ def test_robot_whose_fence_is_upside_down_is_never_armed() -> None:
 
 @pytest.mark.parametrize("loop", ["position", "attitude"])
 @pytest.mark.parametrize(("bandwidth", "damping", "holds"), [
-    (2.5, 0.14, False), (2.5, 0.16, True), (8.0, 0.3, False), (8.0, 0.5, True), (8.0, 3.1, True), (8.0, 5.0, False), (5.0, 5.0, True),
+    (2.5, 0.14, False), (2.5, 0.16, True), (8.0, 0.3, False), (8.0, 0.5, True), (8.0, 3.1, True), (8.0, 3.15, False), (8.0, 5.0, False),
+    (5.0, 0.3, True), (5.0, 5.0, True),
 ])  # fmt: skip
 def test_robot_whose_loop_would_swing_is_never_armed(loop: str, bandwidth: float, damping: float, holds: bool) -> None:
     """Flown: 8 rad/s swings at damping ratios of 0.3 and 5, and holds at 0.5 and 3."""
@@ -134,6 +135,7 @@ def test_robot_whose_thrusters_are_slower_than_its_gains_is_never_armed(loop: st
     for forced in (False, True):
         found = reasons(parameters=sluggish, forced=forced)
         assert len(found) == (not holds) and all(words.startswith(f"limiter.slew_n_per_s is {slew:g}") for words in found)
+        assert all(words.endswith(f"at least {5.0 * bandwidth:g} N/s permitted") for words in found)
 
 
 def test_robot_that_could_not_notice_a_joint_without_current_is_never_armed() -> None:

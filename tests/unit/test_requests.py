@@ -22,13 +22,13 @@ STICKS = Sticks((0.1, 0.2, 0.3), (0.4, 0.5, 0.6))
 
 
 class Path:
-    """A trajectory that may be invalid."""
+    """A trajectory that may be invalid, at its start, at its end, or both."""
 
-    def __init__(self, point: Any = HERE, duration_s: Any = 2.0) -> None:
-        self.point, self.duration_s = point, duration_s
+    def __init__(self, start: Any = HERE, duration_s: Any = 2.0, end: Any = None) -> None:
+        self.start, self.duration_s, self.end = start, duration_s, start if end is None else end
 
     def sample(self, t_s: float) -> Any:
-        return self.point
+        return self.start if t_s == 0.0 else self.end
 
 
 def spoilt(**parts: Any) -> Setpoint:
@@ -51,6 +51,7 @@ UNSOUND: list[tuple[Action, Any]] = [
     *[(Action.SET_POINT, x) for x in (None, *UNPLACED[1:3], *UNPLACED[4:6], *MALFORMED, spoilt(q_wb=np.array([1.0, 0.0, NAN, 0.0])))],
     *[(Action.TRACK, x) for x in (None, HERE, 2.0, Path(duration_s=NAN), Path(duration_s=-1.0), Path(duration_s="long"))],
     *[(Action.TRACK, Path(x)) for x in (None, *UNPLACED, *MALFORMED)],
+    (Action.TRACK, Path(HERE, end=UNPLACED[0])), (Action.TRACK, Path(UNPLACED[0], end=HERE)),
     (Action.TRACK, type("Sampleless", (), {"duration_s": 1.0})()),
     (Action.TRACK, type("Endless", (), {"sample": lambda self, t: HERE})()),
     *[(Action.SET_MODE, x) for x in (3, None, "AUTO", Mode.DOCK)],
@@ -72,7 +73,8 @@ SOUND_ONES: list[tuple[Action, Any]] = [
     (Action.STICKS, STICKS), (Action.STICKS, Sticks((1.0, -1.0, 0))), (Action.SET_MODE, Mode.AUTO),
     (Action.SET_POINT, HERE), (Action.SET_POINT, spoilt(p_wb=ZERO * NAN)),
     (Action.SET_POINT, spoilt(q_wb=LEVEL * NAN, v_w=np.array([NAN, 0.0, 0.1]))), (Action.SET_PARAMETER, ("control.lead_s", 0.1)),
-    (Action.MOTOR_TEST, (7, -0.1, 2)), (Action.HOLD, spoilt(q_wb=LEVEL * 1.0009)), (Action.HOLD, spoilt(p_wb=np.full(3, 1e6))),
+    (Action.MOTOR_TEST, (0, 0.1, 1.0)), (Action.MOTOR_TEST, (7, -0.1, 2)),
+    (Action.HOLD, spoilt(q_wb=LEVEL * 1.0009)), (Action.HOLD, spoilt(p_wb=np.full(3, 1e6))),
 ]  # fmt: skip
 ENDS_A_TASK = [
     Request(Action.DISARM, 1), Request(Action.DISARM, 1, True), Request(Action.HOLD, 1), Request(Action.SET_MODE, 1, Mode.POSHOLD),

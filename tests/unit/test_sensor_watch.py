@@ -1,6 +1,7 @@
 """Samples of a frozen IMU and readings that leap are detected and not used; the body flies on without them."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -108,8 +109,11 @@ def test_imu_that_leaps_with_every_sample_is_not_heard(broken: str) -> None:
 def test_pressure_that_is_repeated_for_two_seconds_is_not_believed_until_it_changes() -> None:
     watch = SensorWatch([0])
 
+    rng = np.random.default_rng(0)
+
     def is_heard(pressure_pa: float) -> bool:
-        watch.step([ModuleInputs(pressure_pa=pressure_pa)])
+        watch.step([ModuleInputs(gyro=0.1 * rng.normal(size=3), accel=0.1 * rng.normal(size=3), pressure_pa=pressure_pa)])
+        assert watch.imu_heard, "the live IMU beside it is"
         return watch.pressure_heard
 
     assert [is_heard(1.1e5) for _ in range(103)] == [True] * 100 + [False] * 3, "at 50 Hz"
@@ -220,16 +224,27 @@ def test_robot_whose_imu_freezes_holds_its_place_and_says_so() -> None:
 # ---------------------------------------------------------------- readings that leap
 
 
-def readings(*values: float, name: str) -> list[bool]:
-    """Which of the readings, given in multiples of the leap threshold, are believed."""
-    watch = SensorWatch([0])
-    samples = [value * LEAPS[name] for value in values]
-    inputs = [ModuleInputs(**{name: x if name == "pressure_pa" else np.array([0.0, x, 0.0])}) for x in samples]  # type: ignore[arg-type]
-    return [getattr(watch.step([module])[0], name) is not None for module in inputs]
+def readings(*values: float | None, name: str, axis: int = 1) -> list[bool]:
+    """Which of the readings are believed; given in multiples of the leap threshold, None where none came."""
+    watch, heard = SensorWatch([0]), []
+    unit: Any = 1.0 if name == "pressure_pa" else np.eye(3)[axis]
+    for value in values:
+        module = ModuleInputs()
+        if value is not None:
+            setattr(module, name, value * LEAPS[name] * unit)
+        heard.append(getattr(watch.step([module])[0], name) is not None)
+    return heard
+
+
+@pytest.mark.parametrize("name", ["gyro", "accel"])
+@pytest.mark.parametrize("axis", range(3))
+def test_leap_about_any_axis_is_found(name: str, axis: int) -> None:
+    assert readings(0.0, 5.0, 0.0, name=name, axis=axis) == [True, False, True]
 
 
 @pytest.mark.parametrize("name", LEAPS)
 def test_reading_that_leaps_is_left_out_and_one_that_stays_there_is_believed(name: str) -> None:
+    assert readings(0.0, None, 5.0, None, 5.2, name=name) == [True, False, False, False, True], "with ticks between without a frame"
     assert readings(0.0, 0.0, 5.0, 0.0, 0.9, 0.0, name=name) == [True, True, False, True, True, True]
     assert readings(0.0, 5.0, 5.2, 5.4, name=name) == [True, False, True, True]
     assert readings(0.0, 5.0, -5.0, 0.0, name=name) == [True, False, False, True]
