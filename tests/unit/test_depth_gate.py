@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from firmware_py.core.depth_gate import DOUBT, LEAST_GATE_M, MOST_SPEED_M_S, MOST_STEP_M, SETTLED, DepthGate
-from firmware_py.core.types import ExpectedDepth, Mode, ModuleInputs
+from firmware_py.core.rotations import from_euler, to_matrix
+from firmware_py.core.types import BodyPose, ExpectedDepth, Mode, ModuleInputs
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.description.water import ATMOSPHERE_PA, PA_PER_M
 from firmware_py.prepare.assembly import assemble
@@ -125,6 +126,8 @@ def test_body_that_rests_believes_a_sensor_that_jumped_once_it_has_settled(jumpe
     told(gate, [8.0] * jumped, None)
     assert told(gate, [8.0] * 2 * SETTLED, None)[-1] is None, "an armed one does not"
     assert told(gate, [8.0], None, armed=False) == [8.0]
+    told(gate, [8.0] * 2 * SETTLED, None)
+    assert told(gate, [5.0] * 2 * SETTLED, None, armed=False)[: SETTLED + 1] == [None] * SETTLED + [5.0]
     gate = DepthGate(single())
     assert told(gate, [3.15] + [3.0] * 2 * SETTLED, None, armed=False)[-1] == 3.0
 
@@ -204,6 +207,19 @@ def test_each_module_is_judged_by_itself_where_it_is() -> None:
     part.take_over([gate])
     part.step(next(CLOCK), [ModuleInputs(), ModuleInputs(pressure_pa=below)], None, armed=True)
     assert not part.heard
+
+
+def test_pictures_of_a_body_that_rolls_convict_none_of_its_sensors() -> None:
+    """The picture shows a tag, the sensors are elsewhere: each is compared with where the attitude of the picture puts it."""
+    gate, lever_b, on_the_way = DepthGate(PAIR), np.array([0.05, 0.1, -0.2]), []
+    for n in range(300):
+        now_ns, q_wb = next(CLOCK), from_euler(0.5 * math.sin(0.08 * n), 0.3 * math.sin(0.05 * n), 0.0)
+        turned = to_matrix(q_wb)
+        readings = [ModuleInputs(pressure_pa=pressure_at(3.0 + below_m)) for below_m in PAIR.r_bi @ turned[2]]
+        left = gate.step(now_ns, readings, ExpectedDepth(3.0, 0.003, tuple(turned[2])), armed=True)
+        assert [module.pressure_pa for module in left] == [module.pressure_pa for module in readings]
+        on_the_way.append(BodyPose(now_ns, turned @ lever_b + [1.0, 2.0, 3.0], lever_b, q_wb, 1.0))
+        gate.compare(on_the_way[-3:-2])
 
 
 # ---------------------------------------------------------------- the robot
