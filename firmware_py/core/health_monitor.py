@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
-from typing import Any
 
 from firmware_py.core.body import Body, axes_without_thrust
 from firmware_py.core.faults import ESC_DOWN, ThrusterFaults, by_channel
@@ -66,6 +65,23 @@ class _Latest:
     push_m2_s2: float = 0.0
 
 
+class PerModule:
+    """By fleet index: the last report of each module of the body, and its time, ns. A body inherits every table in it with its modules."""
+
+    def __init__(self, modules: Sequence[int]) -> None:
+        never = dict.fromkeys(modules, NEVER_NS)
+        self.heard_ns, self.hears_ns, self.answered_ns, self.late_ns = (never.copy() for _ in range(4))
+        self.battery_ns, self.cabin_ns, self.wet_ns = (never.copy() for _ in range(3))
+        self.unfit, self.leak, self.wet = (dict.fromkeys(modules, False) for _ in range(3))
+        self.voltage_share, self.cabin_c, self.cabin_start_pa, self.cabin_change_pa = (dict[int, float]() for _ in range(4))
+
+    def take_over(self, other: PerModule) -> None:
+        """Takes over every report of the modules of this body from a body before."""
+        mine = self.heard_ns.keys()
+        for name, reports in vars(self).items():
+            reports.update({module: told for module, told in getattr(other, name).items() if module in mine})
+
+
 class HealthMonitor:
     """Keeps the ages and running means of one body."""
 
@@ -79,16 +95,7 @@ class HealthMonitor:
         self._esc_ns = [NEVER_NS] * len(self._places)
         self._unknown_esc_ns: dict[Place, int] = {}
         """When an ESC was last heard that belongs to no thruster, by its place."""
-        never = dict.fromkeys(body.modules, NEVER_NS)
-        self._heard_ns, self._hears_ns, self._answered_ns, self._late_ns = (never.copy() for _ in range(4))
-        self._battery_ns, self._cabin_ns, self._wet_ns = (never.copy() for _ in range(3))
-        self._unfit, self._leak, self._wet = (dict.fromkeys(body.modules, False) for _ in range(3))
-        self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa = (dict[int, float]() for _ in range(4))
-        self._per_module: tuple[dict[int, Any], ...] = (
-            self._heard_ns, self._hears_ns, self._answered_ns, self._late_ns, self._battery_ns, self._cabin_ns, self._wet_ns, self._unfit,
-            self._leak, self._wet, self._voltage_share, self._cabin_c, self._cabin_start_pa, self._cabin_change_pa,
-        )  # fmt: skip
-        """By fleet index: the last report of each module of the body, and its time."""
+        self._of = PerModule(body.modules)
         self._stopped_ns: dict[int, int] = {}
         """By fleet index: when a module last reported being held by an e-stop. A module that reports otherwise is removed."""
         self._latest = _Latest()
@@ -119,8 +126,7 @@ class HealthMonitor:
         for other in before:
             self._stopped_ns |= other._stopped_ns
             self._unknown_esc_ns |= {at: ns for at, ns in other._unknown_esc_ns.items() if at.module in self._thruster_at}
-            for mine, theirs in zip(self._per_module, other._per_module, strict=True):
-                mine |= {module: told for module, told in theirs.items() if module in self._thruster_at}
+            self._of.take_over(other._of)
             for module, thrusters in self._thruster_at.items():
                 for channel, thruster in other._thruster_at.get(module, {}).items():
                     self._esc_ns[thrusters[channel]] = other._esc_ns[thruster]
@@ -131,7 +137,7 @@ class HealthMonitor:
         now, latest = inputs.time_ns, self._latest
         if latest.time_ns == NEVER_NS:  # first tick: silence counts from here
             latest.time_ns = latest.depth_ns = latest.imu_ns = latest.ready_ns = now
-            for heard_ns in (self._heard_ns, self._hears_ns):
+            for heard_ns in (self._of.heard_ns, self._of.hears_ns):
                 heard_ns.update(dict.fromkeys(heard_ns, now))
         self._listen(inputs.modules, now)
         self._hear_stops(inputs.modules, now)
@@ -156,7 +162,7 @@ class HealthMonitor:
     def _figures(self, estimate: Estimate, faults: ThrusterFaults, stopped_ns: int) -> Health:
         """Returns all figures at the end of the tick. `stopped_ns`: by how much the tick began later than a period after the last one."""
         now, latest = self._latest.time_ns, self._latest
-        silent = tuple([m for m, at in self._answered_ns.items() if now - at > self._answer_ns])
+        silent = tuple([m for m, at in self._of.answered_ns.items() if now - at > self._answer_ns])
         return Health(
             time_ns=now,
             ready=estimate.ready,
@@ -167,14 +173,14 @@ class HealthMonitor:
             depth_age_s=(now - latest.depth_ns) * 1e-9,
             depth_heard=latest.depth_heard,
             imu_age_s=(now - latest.imu_ns) * 1e-9,
-            voltage_share=min(self._voltage_share.values(), default=math.nan),
-            leak=any(self._leak.values()),
-            cabin_c=max(self._cabin_c.values(), default=math.nan),
-            cabin_change_pa=max(self._cabin_change_pa.values(), default=math.nan),
-            stopped=tuple([m for m, at in self._stopped_ns.items() if m in self._heard_ns or now - at <= self._answer_ns]),
+            voltage_share=min(self._of.voltage_share.values(), default=math.nan),
+            leak=any(self._of.leak.values()),
+            cabin_c=max(self._of.cabin_c.values(), default=math.nan),
+            cabin_change_pa=max(self._of.cabin_change_pa.values(), default=math.nan),
+            stopped=tuple([m for m, at in self._stopped_ns.items() if m in self._of.heard_ns or now - at <= self._answer_ns]),
             silent=silent,
-            silent_s=(now - min(self._hears_ns.values())) * 1e-9,
-            bus_silent_s=max(now - max(self._heard_ns.values()), stopped_ns) * 1e-9,
+            silent_s=(now - min(self._of.hears_ns.values())) * 1e-9,
+            bus_silent_s=max(now - max(self._of.heard_ns.values()), stopped_ns) * 1e-9,
             esc_missing=tuple([self._places[i] for i in _older(self._esc_ns, now - self._esc_fresh_ns)]),
             frame_errors_per_s=latest.error_rate,
             missed_ticks_per_s=latest.missed_rate,
@@ -189,48 +195,48 @@ class HealthMonitor:
             warm=self.warm,
             open_joints=self.open_joints,
             tag_gap_s=self._tag_gap_s(now),
-            unfit=tuple([m for m, unfit in self._unfit.items() if unfit]),
-            battery_age_s=(now - min(self._battery_ns.values())) * 1e-9,
-            cabin_age_s=(now - min(self._cabin_ns.values())) * 1e-9,
+            unfit=tuple([m for m, unfit in self._of.unfit.items() if unfit]),
+            battery_age_s=(now - min(self._of.battery_ns.values())) * 1e-9,
+            cabin_age_s=(now - min(self._of.cabin_ns.values())) * 1e-9,
             push_m_s=math.sqrt(latest.push_m2_s2),
             esc_unknown=tuple([at for at, ns in self._unknown_esc_ns.items() if now - ns <= self._esc_fresh_ns]),
             collision_s=self.collision_s,
             unready_s=(now - latest.ready_ns) * 1e-9,
             without_thrust=self._without_thrust,
-            late=tuple([m for m in silent if now - self._late_ns[m] <= self._answer_ns]),
+            late=tuple([m for m in silent if now - self._of.late_ns[m] <= self._answer_ns]),
         )
 
     def _listen(self, modules: Sequence[ModuleInputs], now: int) -> None:
-        for index in self._heard_ns:
+        for index in self._of.heard_ns:
             module = modules[index]
             if module.answered:
-                self._heard_ns[index] = self._answered_ns[index] = now
+                self._of.heard_ns[index] = self._of.answered_ns[index] = now
             elif module.heard:
-                self._heard_ns[index] = now
+                self._of.heard_ns[index] = now
             if module.mcu_state is not None:
-                self._unfit[index] = module.mcu_state in MCU_UNFIT
+                self._of.unfit[index] = module.mcu_state in MCU_UNFIT
                 if not module.answered:
-                    self._late_ns[index] = now
-            if self._heard_ns[index] == now and not self._unfit[index]:
-                self._hears_ns[index] = now
+                    self._of.late_ns[index] = now
+            if self._of.heard_ns[index] == now and not self._of.unfit[index]:
+                self._of.hears_ns[index] = now
             for tag in module.tags:
                 if tag.capture_ns > self._pictures_ns[1]:
                     self._pictures_ns = self._pictures_ns[1], tag.capture_ns
             if module.leak is not None:
-                self._wet_ns[index] = now if module.leak and self._wet[index] else self._wet_ns[index]
-                self._leak[index] = module.leak or now - self._wet_ns[index] < DRY_NS
-                self._wet[index] = module.leak
+                self._of.wet_ns[index] = now if module.leak and self._of.wet[index] else self._of.wet_ns[index]
+                self._of.leak[index] = module.leak or now - self._of.wet_ns[index] < DRY_NS
+                self._of.wet[index] = module.leak
             if module.voltage_v is not None and math.isfinite(module.voltage_v):
-                self._battery_ns[index] = now
+                self._of.battery_ns[index] = now
                 share = module.voltage_v / self._nominal_v[index]
-                before = self._voltage_share.get(index, share)
-                self._voltage_share[index] = before + VOLTAGE_SHARE * (share - before)
+                before = self._of.voltage_share.get(index, share)
+                self._of.voltage_share[index] = before + VOLTAGE_SHARE * (share - before)
             if module.cabin_temperature_c is not None and math.isfinite(module.cabin_temperature_c):
-                self._cabin_ns[index] = now
-                self._cabin_c[index] = module.cabin_temperature_c
+                self._of.cabin_ns[index] = now
+                self._of.cabin_c[index] = module.cabin_temperature_c
             if module.cabin_pressure_pa is not None and math.isfinite(module.cabin_pressure_pa):
-                start = self._cabin_start_pa.setdefault(index, module.cabin_pressure_pa)
-                self._cabin_change_pa[index] = abs(module.cabin_pressure_pa - start)
+                start = self._of.cabin_start_pa.setdefault(index, module.cabin_pressure_pa)
+                self._of.cabin_change_pa[index] = abs(module.cabin_pressure_pa - start)
             if module.esc:
                 self._hear_escs(index, module.esc, now)
 

@@ -11,7 +11,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.faults import ThrusterFaults
 from firmware_py.core.fence import outside
 from firmware_py.core.health import NEVER_S, Health
-from firmware_py.core.health_monitor import HealthMonitor
+from firmware_py.core.health_monitor import HealthMonitor, PerModule
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import exp
 from firmware_py.core.thruster_names import Place
@@ -529,3 +529,12 @@ def test_push_is_known_to_a_body_that_two_have_become() -> None:
     joined.time_ns = bench.time_ns
     joined.monitor.take_over([bench.monitor, other.monitor])
     assert joined.step(force_w=np.array([8.0, 0.0, 0.0])).push_m_s == pytest.approx(math.sqrt(8.0 / BODY.drag.mean), rel=1e-3)
+
+
+def test_body_inherits_every_report_of_its_modules_and_of_no_other() -> None:
+    """A figure of a module that is added to PerModule needs no second place: forgotten there, it began anew at every dock."""
+    pair, one = PerModule([1, 3]), PerModule([3])
+    for tables in vars(pair).values():
+        tables.update({1: "told by 1", 3: "told by 3"})
+    one.take_over(pair)
+    assert vars(one) == {name: {3: "told by 3"} for name in vars(pair)}
