@@ -45,6 +45,11 @@ class Wire:
             "frame_corrupt": lambda copies: [self._corrupted(copy) for copy in copies],
         }
 
+    @property
+    def kinds(self) -> set[str]:
+        """Kinds of fault of a wire."""
+        return {*self._changes, "frame_delay", "babble"}
+
     def pass_on(self, frames: Iterable[Frame], faults: Sequence[Fault], time_ns: int) -> list[Frame]:
         """Returns the frames that leave the wire now, those due after a delay first."""
         mine = [f for f in faults if f.direction in (self._direction, "both")]
@@ -65,7 +70,7 @@ class Wire:
         for fault in faults:
             if fault.kind == "frame_delay":
                 late_ns += round(1e6 * fault.value)
-            elif fault.kind in self._changes and self._rng.random() < fault.value:
+            elif fault.kind != "babble" and self._rng.random() < fault.value:
                 copies = self._changes[fault.kind](copies)
         if not late_ns:
             return copies
@@ -120,10 +125,22 @@ class Faults:
             "foreign_command": lambda time_ns: self._command_relays(),
         }
         """Frames of each foreign node in a tick, in order of CAN id: the lower id wins arbitration."""
+        self._misreads: dict[str, Callable[[Sighting, float], Sighting | None]] = {
+            "tag_flip": lambda sighting, share: sighting._replace(q_wt=_flipped(sighting)) if self._tags.random() < share else sighting,
+            "tag_jump": lambda sighting, north_m: sighting._replace(p_wt=sighting.p_wt + np.array([north_m, 0.0, 0.0])),
+            "tag_absent": lambda sighting, _: None,
+            "camera_bias": lambda sighting, off_m: sighting._replace(p_wt=sighting.p_wt + off_m * self._bias_axis),
+        }
+        """What cameras make of a sighting, by the value of the fault; None: lost."""
         self._estop_due_ns = self._commands = 0
         self._dock_command = nodes.codec.message("DOCK_CMD")
         for camera in nodes.cameras:
             camera.change = self._change_tag
+
+    @property
+    def carried_out(self) -> set[str]:
+        """Kinds of fault that have an effect: in the plant, before the cameras, by foreign nodes, on the wire, or of the process."""
+        return {*self._breaks, *self._misreads, *self._intruders, *self._to_plant.kinds, "process_killed"}
 
     def add(self, fault: Fault) -> None:
         """Adds a fault live. Raises DescriptionError for one that would have no effect."""
@@ -217,16 +234,12 @@ class Faults:
         """
         for fault in self._on:
             modules = self._modules(fault)
-            if not fault.kind.startswith(("tag_", "camera_")) or sighting.module not in modules or carrier in modules:
+            if fault.kind not in self._misreads or sighting.module not in modules or carrier in modules:
                 continue
-            if fault.kind == "tag_absent":
+            seen = self._misreads[fault.kind](sighting, fault.value)
+            if seen is None:
                 return None
-            if fault.kind == "camera_bias":
-                sighting = sighting._replace(p_wt=sighting.p_wt + fault.value * self._bias_axis)
-            elif fault.kind == "tag_jump":
-                sighting = sighting._replace(p_wt=sighting.p_wt + np.array([fault.value, 0.0, 0.0]))
-            elif self._tags.random() < fault.value:
-                sighting = sighting._replace(q_wt=_flipped(sighting))
+            sighting = seen
         return sighting
 
 

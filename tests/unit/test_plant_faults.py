@@ -10,7 +10,7 @@ from firmware_py.bus.codec import Frame, Receiver
 from firmware_py.description.schema import DescriptionError
 from hil.faults import Faults, Wire
 from hil.nodes import Nodes, make_nodes
-from hil.plant.fault_spec import THRUSTER_KINDS, Fault
+from hil.plant.fault_spec import FRAME_KINDS, TAKES, THRUSTER_KINDS, Fault
 from hil.scenario import load_scenario, make_world
 from tests.unit.mcu_frames import ARMED, CODEC, sync, thrust
 
@@ -56,6 +56,13 @@ def test_every_kind_of_broken_thruster_pushes_otherwise_than_a_healthy_one(kind:
     for nodes in (healthy, broken):
         fly(nodes, 10)
     assert broken.world.truth(0).force_n[3] != healthy.world.truth(0).force_n[3]
+
+
+def test_every_kind_of_fault_is_carried_out() -> None:
+    """Regression: a kind that only the table TAKES named was accepted in a scenario and live, and did nothing without a word."""
+    faults = Faults(nodes_with())
+    assert faults.carried_out == set(TAKES)
+    assert Wire(0, "both").kinds == set(FRAME_KINDS)
 
 
 def test_lying_thruster_reports_the_speed_of_a_healthy_one() -> None:
