@@ -24,6 +24,8 @@ OFFSET_SATURATED_MS = 25.5
 USABLE_STATUS = (0, 1)
 """Sensor status OK and SATURATED; a stale or failed sensor's values are not passed on."""
 SENSOR_FAULT = 15
+FOREIGN = frozenset(("ESTOP", "SYNC", "DOCK_CMD", "THRUSTER_CMD_A", "THRUSTER_CMD_B", "HEARTBEAT"))
+"""Messages that no module sends; what another node says with them, `InputCollector` takes without a handler."""
 THRUSTERS_OF_A_FRAME = 4
 ESTOP_PERIOD_NS = 50_000_000
 """ESTOP goes out at 20 Hz while it is raised."""
@@ -55,7 +57,7 @@ class InputCollector:
         self.faults: dict[str, int] = dict.fromkeys(kinds, 0)
         self.without_status = set(range(len(fleet.module)))
         named = self._make_handlers()
-        self._handlers = [named.get(message.name) for message in codec.messages]
+        self._handlers = [None if message.name in FOREIGN else named[message.name] for message in codec.messages]
         self._names = [message.name for message in codec.messages]
         self._tag_position = self._names.index("TAG_POSITION")
         self._from_camera = frozenset((self._tag_position, self._names.index("TAG_ATTITUDE")))
