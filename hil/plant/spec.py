@@ -7,7 +7,7 @@ Read once from a scenario file. A magnitude of zero switches an error off. Value
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -77,14 +77,12 @@ class WorldSpec:
             raise DescriptionError("deadband_low_n is above deadband_high_n")
 
 
-CALM: dict[str, float] = dict.fromkeys(
-    (
-        "current_m_s", "gust_m_s", "buoyancy_error_n", "righting_spread_m", "trim_m", "mass_spread", "inertia_spread",
-        "drag_spread", "gain_spread", "thruster_lag_s", "deadband_low_n", "deadband_high_n", "supply_resistance_ohm",
-        "supply_limit", "jet_strength",
-    ),
-    0,
+WATER = (
+    "density", "gravity", "atmosphere_pa", "temperature_c", "gust_time_s", "gust_smoothing_s", "jet_length_m", "jet_radius_m",
+    "wall_stiffness", "wall_damping",
 )  # fmt: skip
+"""Values of a world that are no errors."""
+CALM: dict[str, float] = {field.name: 0 for field in fields(WorldSpec) if field.name not in WATER}
 """Overrides that switch every error of the world off."""
 
 
@@ -132,14 +130,9 @@ class SensorSpec:
     dock_sigma_ma: float = quantity(4.0, unit="mA", low=0, high=1000, help="noise of the magnet currents (synthetic)")
 
 
-IDEAL: dict[str, float] = dict.fromkeys(
-    (
-        "gyro_sigma", "gyro_bias", "gyro_walk", "accel_sigma", "accel_bias", "accel_walk", "depth_sigma_m",
-        "depth_bias_m", "depth_walk", "tag_phase", "tag_delay_ms", "tag_sigma_m", "tag_sigma_axis_m", "tag_sigma_deg",
-        "tag_dropped", "tag_flipped", "voltage_sigma_v", "current_sigma_a", "rpm_sigma", "dock_sigma_ma",
-    ),
-    0,
-)  # fmt: skip
+CAMERA = ("tag_rate_hz", "tag_incidence_deg", "tag_all")
+"""Values of the sensors that are no errors."""
+IDEAL: dict[str, float] = {field.name: 0 for field in fields(SensorSpec) if field.name not in CAMERA}
 """Overrides for perfect sensors: no noise, no bias, no delay."""
 HALF_A_COUNT = {"gyro_sigma": 0.00025, "accel_sigma": 0.001, "depth_sigma_m": 0.00005, "tag_sigma_deg": 0.09}
 """Noise that remains with ideal sensors: half a count of the frames. An IMU or pressure reading that repeats to the last bit counts as
