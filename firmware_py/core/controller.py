@@ -17,14 +17,18 @@ from firmware_py.core.rotations import V, cross, difference, rotate, rotate_back
 from firmware_py.core.types import Estimate, Setpoint
 from firmware_py.description.parameters import Control
 
-LAWS = {"model": True, "paper": False}
-"""By control law: whether C and D are those of the wanted motion, and g is counteracted; else C and D are those of the present one."""
 SETPOINT = f"{V},{V},{V},{V},{V},{V}"
 """Types of a Setpoint's fields."""
 
 
 class Controller:
-    """Stateless control law. All gains are computed at construction."""
+    """Stateless control law. All gains are computed at construction; other gains, a dock or an undock make a new object.
+
+    Attributes:
+        is_model: whether C and D are those of the wanted motion, and g is counteracted; else C and D are those of the present one.
+    """
+
+    is_model = True
 
     def __init__(self, body: Body, parameters: Control) -> None:
         p = parameters
@@ -33,7 +37,7 @@ class Controller:
         self._kd = np.repeat(
             [2 * p.position_damping * p.position_bandwidth, 2 * p.attitude_damping * p.attitude_bandwidth], 3
         )
-        self._law = LAWS[p.law], p.drag_feedforward, p.disturbance_feedforward
+        self._law = self.is_model, p.drag_feedforward, p.disturbance_feedforward
 
     def step(self, now: Setpoint, ahead: Setpoint, estimate: Estimate) -> np.ndarray:
         """Returns the wanted wrench, (6,), body frame.
@@ -49,6 +53,16 @@ class Controller:
                 *now, *ahead, e.p_wb, e.q_wb, e.nu, e.force_w, e.moment_b, self._kp, self._kd, *self._law, *self._plant
             )
         )
+
+
+class PaperController(Controller):
+    """The paper's control law (Eq. 3)."""
+
+    is_model = False
+
+
+LAWS: dict[str, type[Controller]] = {"model": Controller, "paper": PaperController}
+"""By `control.law`: the class that computes the wrench in `step`."""
 
 
 @njit(cache=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from firmware_py.core.allocator import Allocator
 from firmware_py.core.body import Body
-from firmware_py.core.controller import Controller
+from firmware_py.core.controller import LAWS
 from firmware_py.core.depth_gate import DepthGate
 from firmware_py.core.docking import DockingStage, tag_table
 from firmware_py.core.estimator import Estimator
@@ -76,7 +76,7 @@ class BodyPipeline:
         self._judged_ns, self._could_arm = -ARMING_EVERY_NS, False
         self.parting: list[DockRequest] = []
         """Open joints for which a plan was last requested."""
-        self.controller = Controller(body, parameters.control)
+        self.controller = LAWS[parameters.control.law](body, parameters.control)
         self.allocator = Allocator(body, parameters.allocation)
         self.limiter = Limiter(body, parameters.limiter, period_ns * 1e-9)
         self.lag = ThrusterLag(body.thrusters, period_ns * 1e-9)
@@ -92,7 +92,7 @@ class BodyPipeline:
         for stage in (self.health, self.supervisor, self.guidance):
             stage.retune(parameters)
         self.limiter.retune(parameters.limiter)
-        self.controller = Controller(self.body, parameters.control)
+        self.controller = LAWS[parameters.control.law](self.body, parameters.control)
         if parameters.allocation != self.allocator.parameters:
             self.allocator = Allocator(self.body, parameters.allocation)
             self.allocator.set_alive(self.faults.now.alive)

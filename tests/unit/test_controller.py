@@ -67,7 +67,7 @@ def surprise(body: Body, parameters: Control, q_wb: np.ndarray) -> float:
     disturbance = np.array([2.0, -1.0, 0.5, 0.1, 0.2, -0.1])
     nu = velocity_of(setpoint)
     estimate = believed(setpoint.p_wb, q_wb, nu, disturbance)
-    wrench = Controller(body, parameters).step(setpoint, setpoint, estimate)
+    wrench = LAWS[parameters.law](body, parameters).step(setpoint, setpoint, estimate)
     turn = Rotation.from_quat(q_wb[[1, 2, 3, 0]])
     external = wrench + np.r_[turn.inv().apply(disturbance[:3]), disturbance[3:]]
     return float(np.abs(propagation.acceleration(nu, q_wb, external, *body.plant) - acceleration_of(setpoint)).max())
@@ -159,7 +159,7 @@ def test_paper_law_feeds_measured_velocity_into_drag_and_the_default_does_not(bo
     nu = np.array([0.5, 0.0, 0.0, 0.0, 0.0, 0.0])
     hold = rest_at(np.zeros(3), LEVEL)
     pushed = believed(np.zeros(3), LEVEL, nu)
-    model, paper = (Controller(body, Control(law=law)).step(hold, hold, pushed) for law in ("model", "paper"))
+    model, paper = (LAWS[law](body, Control()).step(hold, hold, pushed) for law in ("model", "paper"))
     damping = -2.0 * Control().position_damping * Control().position_bandwidth * body.mass[:, 0] * 0.5
     np.testing.assert_allclose(model[:3], damping[:3], atol=1e-9)
     assert paper[0] > model[0] + 1.0

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from firmware_py.core.body import Body
+from firmware_py.core.controller import LAWS, Controller
 from firmware_py.core.failsafes import Level
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
 from firmware_py.core.setpoint import rest_at
-from firmware_py.core.types import Action, Mode, ModuleInputs, Request
+from firmware_py.core.types import Action, Estimate, Mode, ModuleInputs, Request, Setpoint
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble
@@ -36,6 +37,21 @@ def test_disarmed_robot_is_wanted_where_it_is(tank: Tank) -> None:
     record = tank.run(1.0).records[0]
     np.testing.assert_array_equal(record.setpoint.p_wb, record.estimate.p_wb)
     np.testing.assert_array_equal(record.setpoint.q_wb, record.estimate.q_wb)
+
+
+def test_control_law_of_one_s_own_steers_and_keeps_doing_so_with_new_gains(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: a law was a yes or no of the paper's formula, and one with a formula of its own had no place."""
+
+    class Heave(Controller):
+        def step(self, now: Setpoint, ahead: Setpoint, estimate: Estimate) -> np.ndarray:
+            return np.array([0.0, 0.0, 2.5, 0.0, 0.0, 0.0])
+
+    monkeypatch.setitem(LAWS, "model", Heave)
+    own = Tank([single()])
+    own.run(1.0)
+    for request in (Request(Action.ARM), Request(Action.SET_PARAMETER, argument=("control.position_bandwidth", 2.0))):
+        own.run(DT, request)
+        assert own.run(1.0).records[0].wrench[2] == 2.5
 
 
 def test_robot_that_may_not_arm_says_why(tank: Tank) -> None:
