@@ -69,6 +69,7 @@ def wire_parts(codec: Codec) -> dict[str, Any]:
         "crc_table": rows(TABLE),
         "slow_first": slow[0],
         "slow_last": slow[-1],
+        "slow_count": len(slow),
         "number_step": f"{NUMBER_STEP}u",
     }
 

@@ -9,6 +9,9 @@
 #define NODE_THRUSTERS (8)
 #define NODE_FACES (6)
 #define NODE_SLOW (9)
+#if NODE_SLOW != MODCUBE_SLOW_COUNT
+#error "the DBC has other slow messages: they belong into node_readings here, send_slow in node.c and Readings in board.py"
+#endif
 #define NODE_VERSION (1u)
 #define NODE_TIMEOUT_NS (100000000)  /* a half of THRUSTER_CMD that is older commands zero */
 #define NODE_RELEASE_NS (200000000)  /* silence of ESTOP frames after which the e-stop may be released */

@@ -55,6 +55,14 @@ def fly(bench: Bench) -> tuple[list[Any], float]:
     return log, float(abs(bench.nodes.world.truth(0).v_w).max())
 
 
+def test_c_node_does_not_compile_with_a_slow_message_that_it_does_not_send(tmp_path: Path) -> None:
+    """Regression: it sent a new slow message with what stood before its ESC readings in memory, and no ENVIRONMENT any more."""
+    folder = shutil.copytree(FOLDER, tmp_path / "node")
+    (tmp_path / "modcube_wire.h").write_text("#define MODCUBE_SLOW_COUNT (10)\n", encoding="utf-8")
+    result = subprocess.run(["gcc", "-E", f"-I{tmp_path}", str(folder / "node.h")], capture_output=True, text=True, check=False)
+    assert result.returncode and "send_slow" in result.stderr
+
+
 @pytest.mark.slow
 def test_hover_with_the_c_node_is_the_hover_with_the_plants_own_frame_for_frame(library: CDLL) -> None:
     flights, scenario = [], shortened("hover", 6.0)
