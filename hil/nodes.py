@@ -177,7 +177,9 @@ class Mcu:
         if name == "POWER":
             noise = self._power.take() * (self._spec.voltage_sigma_v, self._spec.current_sigma_a)
             return [truth.voltage_v + float(noise[0]), truth.current_a + float(noise[1]), 0]
-        return [CABIN_C, CABIN_PA, int(self.leaks)]
+        if name == "ENVIRONMENT":
+            return [CABIN_C, CABIN_PA, int(self.leaks)]
+        raise KeyError(f"no reading for {name}")
 
     def _esc(self, first: int) -> list[float]:
         noise = self._spec.rpm_sigma * self._rpm.take()

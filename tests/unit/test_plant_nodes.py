@@ -53,6 +53,13 @@ def test_every_answer_is_a_valid_frame_at_its_rate() -> None:
     assert count["TAG_POSITION"] == count["TAG_ATTITUDE"] and 215 < count["TAG_POSITION"] < 242
 
 
+def test_slow_message_without_a_reading_of_its_own_is_refused() -> None:
+    """Regression: it was sent with the values of ENVIRONMENT, temperature and pressure of the cabin, where it had as many."""
+    nodes = nodes_of(calm())
+    with pytest.raises(KeyError, match="no reading for VELOCITY"):
+        nodes.mcus[1]._reading("VELOCITY", nodes.world.truth(0))
+
+
 def test_status_comes_last_and_repeats_the_tick() -> None:
     nodes = nodes_of(calm())
     for tick in (70_000, 70_001, 5):
