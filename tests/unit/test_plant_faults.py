@@ -118,6 +118,11 @@ def fault_state(nodes: Nodes) -> list[object]:
     return [*levels, supply, world.docks.relays.tolist(), world.push.tolist(), world.jet_strength, told, depths]
 
 
+def test_every_kind_of_fault_of_the_plant_is_tried_here() -> None:
+    """Regression: one that was never repaired lasted for ever after its end, and no test was of its kind."""
+    assert {fault.kind for fault in SINGLE} == set(Faults(nodes_with())._breaks)
+
+
 def lasting(fault: Fault, at_s: float, until_s: float) -> Fault:
     return dataclasses.replace(fault, at_s=at_s, until_s=until_s)
 
