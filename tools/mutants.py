@@ -39,6 +39,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "firmware_py.core.collision": ("tests/unit/test_collision.py",),
     "firmware_py.core.command_watch": ("tests/unit/test_command_watch.py",),
     "firmware_py.core.limiter": ("tests/unit/test_limiter.py",),
+    "firmware_py.core.motor_test": ("tests/unit/test_motor_test.py",),
+    "firmware_py.description.parameter_rules": ("tests/unit/test_arming.py", "tests/unit/test_live_parameters.py"),
 }
 """Tests of each module, which must kill its mutants."""
 QUICKLY = (

@@ -95,7 +95,7 @@ class HealthMonitor:
         self._esc_ns = [NEVER_NS] * len(self._places)
         self._unknown_esc_ns: dict[Place, int] = {}
         """When an ESC was last heard that belongs to no thruster, by its place."""
-        self._of = PerModule(body.modules)
+        self._reports = PerModule(body.modules)
         self._stopped_ns: dict[int, int] = {}
         """By fleet index: when a module last reported being held by an e-stop. A module that reports otherwise is removed."""
         self._latest = _Latest()
@@ -126,7 +126,7 @@ class HealthMonitor:
         for other in before:
             self._stopped_ns |= other._stopped_ns
             self._unknown_esc_ns |= {at: ns for at, ns in other._unknown_esc_ns.items() if at.module in self._thruster_at}
-            self._of.take_over(other._of)
+            self._reports.take_over(other._reports)
             for module, thrusters in self._thruster_at.items():
                 for channel, thruster in other._thruster_at.get(module, {}).items():
                     self._esc_ns[thrusters[channel]] = other._esc_ns[thruster]
@@ -137,7 +137,7 @@ class HealthMonitor:
         now, latest = inputs.time_ns, self._latest
         if latest.time_ns == NEVER_NS:  # first tick: silence counts from here
             latest.time_ns = latest.depth_ns = latest.imu_ns = latest.ready_ns = now
-            for heard_ns in (self._of.heard_ns, self._of.hears_ns):
+            for heard_ns in (self._reports.heard_ns, self._reports.hears_ns):
                 heard_ns.update(dict.fromkeys(heard_ns, now))
         self._listen(inputs.modules, now)
         self._hear_stops(inputs.modules, now)
@@ -162,7 +162,7 @@ class HealthMonitor:
     def _figures(self, estimate: Estimate, faults: ThrusterFaults, stopped_ns: int) -> Health:
         """Returns all figures at the end of the tick. `stopped_ns`: by how much the tick began later than a period after the last one."""
         now, latest = self._latest.time_ns, self._latest
-        silent = tuple([m for m, at in self._of.answered_ns.items() if now - at > self._answer_ns])
+        silent = tuple([m for m, at in self._reports.answered_ns.items() if now - at > self._answer_ns])
         return Health(
             time_ns=now,
             ready=estimate.ready,
@@ -173,14 +173,14 @@ class HealthMonitor:
             depth_age_s=(now - latest.depth_ns) * 1e-9,
             depth_heard=latest.depth_heard,
             imu_age_s=(now - latest.imu_ns) * 1e-9,
-            voltage_share=min(self._of.voltage_share.values(), default=math.nan),
-            leak=any(self._of.leak.values()),
-            cabin_c=max(self._of.cabin_c.values(), default=math.nan),
-            cabin_change_pa=max(self._of.cabin_change_pa.values(), default=math.nan),
-            stopped=tuple([m for m, at in self._stopped_ns.items() if m in self._of.heard_ns or now - at <= self._answer_ns]),
+            voltage_share=min(self._reports.voltage_share.values(), default=math.nan),
+            leak=any(self._reports.leak.values()),
+            cabin_c=max(self._reports.cabin_c.values(), default=math.nan),
+            cabin_change_pa=max(self._reports.cabin_change_pa.values(), default=math.nan),
+            stopped=tuple([m for m, at in self._stopped_ns.items() if m in self._reports.heard_ns or now - at <= self._answer_ns]),
             silent=silent,
-            silent_s=(now - min(self._of.hears_ns.values())) * 1e-9,
-            bus_silent_s=max(now - max(self._of.heard_ns.values()), stopped_ns) * 1e-9,
+            silent_s=(now - min(self._reports.hears_ns.values())) * 1e-9,
+            bus_silent_s=max(now - max(self._reports.heard_ns.values()), stopped_ns) * 1e-9,
             esc_missing=tuple([self._places[i] for i in _older(self._esc_ns, now - self._esc_fresh_ns)]),
             frame_errors_per_s=latest.error_rate,
             missed_ticks_per_s=latest.missed_rate,
@@ -195,48 +195,48 @@ class HealthMonitor:
             warm=self.warm,
             open_joints=self.open_joints,
             tag_gap_s=self._tag_gap_s(now),
-            unfit=tuple([m for m, unfit in self._of.unfit.items() if unfit]),
-            battery_age_s=(now - min(self._of.battery_ns.values())) * 1e-9,
-            cabin_age_s=(now - min(self._of.cabin_ns.values())) * 1e-9,
+            unfit=tuple([m for m, unfit in self._reports.unfit.items() if unfit]),
+            battery_age_s=(now - min(self._reports.battery_ns.values())) * 1e-9,
+            cabin_age_s=(now - min(self._reports.cabin_ns.values())) * 1e-9,
             push_m_s=math.sqrt(latest.push_m2_s2),
             esc_unknown=tuple([at for at, ns in self._unknown_esc_ns.items() if now - ns <= self._esc_fresh_ns]),
             collision_s=self.collision_s,
             unready_s=(now - latest.ready_ns) * 1e-9,
             without_thrust=self._without_thrust,
-            late=tuple([m for m in silent if now - self._of.late_ns[m] <= self._answer_ns]),
+            late=tuple([m for m in silent if now - self._reports.late_ns[m] <= self._answer_ns]),
         )
 
     def _listen(self, modules: Sequence[ModuleInputs], now: int) -> None:
-        for index in self._of.heard_ns:
+        for index in self._reports.heard_ns:
             module = modules[index]
             if module.answered:
-                self._of.heard_ns[index] = self._of.answered_ns[index] = now
+                self._reports.heard_ns[index] = self._reports.answered_ns[index] = now
             elif module.heard:
-                self._of.heard_ns[index] = now
+                self._reports.heard_ns[index] = now
             if module.mcu_state is not None:
-                self._of.unfit[index] = module.mcu_state in MCU_UNFIT
+                self._reports.unfit[index] = module.mcu_state in MCU_UNFIT
                 if not module.answered:
-                    self._of.late_ns[index] = now
-            if self._of.heard_ns[index] == now and not self._of.unfit[index]:
-                self._of.hears_ns[index] = now
+                    self._reports.late_ns[index] = now
+            if self._reports.heard_ns[index] == now and not self._reports.unfit[index]:
+                self._reports.hears_ns[index] = now
             for tag in module.tags:
                 if tag.capture_ns > self._pictures_ns[1]:
                     self._pictures_ns = self._pictures_ns[1], tag.capture_ns
             if module.leak is not None:
-                self._of.wet_ns[index] = now if module.leak and self._of.wet[index] else self._of.wet_ns[index]
-                self._of.leak[index] = module.leak or now - self._of.wet_ns[index] < DRY_NS
-                self._of.wet[index] = module.leak
+                self._reports.wet_ns[index] = now if module.leak and self._reports.wet[index] else self._reports.wet_ns[index]
+                self._reports.leak[index] = module.leak or now - self._reports.wet_ns[index] < DRY_NS
+                self._reports.wet[index] = module.leak
             if module.voltage_v is not None and math.isfinite(module.voltage_v):
-                self._of.battery_ns[index] = now
+                self._reports.battery_ns[index] = now
                 share = module.voltage_v / self._nominal_v[index]
-                before = self._of.voltage_share.get(index, share)
-                self._of.voltage_share[index] = before + VOLTAGE_SHARE * (share - before)
+                before = self._reports.voltage_share.get(index, share)
+                self._reports.voltage_share[index] = before + VOLTAGE_SHARE * (share - before)
             if module.cabin_temperature_c is not None and math.isfinite(module.cabin_temperature_c):
-                self._of.cabin_ns[index] = now
-                self._of.cabin_c[index] = module.cabin_temperature_c
+                self._reports.cabin_ns[index] = now
+                self._reports.cabin_c[index] = module.cabin_temperature_c
             if module.cabin_pressure_pa is not None and math.isfinite(module.cabin_pressure_pa):
-                start = self._of.cabin_start_pa.setdefault(index, module.cabin_pressure_pa)
-                self._of.cabin_change_pa[index] = abs(module.cabin_pressure_pa - start)
+                start = self._reports.cabin_start_pa.setdefault(index, module.cabin_pressure_pa)
+                self._reports.cabin_change_pa[index] = abs(module.cabin_pressure_pa - start)
             if module.esc:
                 self._hear_escs(index, module.esc, now)
 

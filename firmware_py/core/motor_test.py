@@ -34,10 +34,9 @@ class MotorTest:
 
     def start(self, argument: tuple[int, float, float], time_ns: int) -> None:
         """Starts a test of one thruster: (index, share of largest force, seconds), as checked by `requests`."""
-        self.stop()
         index, share, seconds = argument
         share = max(-self.parameters.test_share, min(self.parameters.test_share, share))
-        force = share * (self._high[index] if share > 0.0 else -self._low[index])
+        force = max(share, 0.0) * self._high[index] - min(share, 0.0) * self._low[index]
         self._plan = [(time_ns + round(1e9 * max(0.0, min(seconds, LONGEST_S))), index, force)]
 
     def detect(self, time_ns: int) -> None:
