@@ -89,6 +89,21 @@ def axes_without_thrust(matrix: np.ndarray, passive: Sequence[int]) -> tuple[int
     return tuple(sorted(found))
 
 
+def deceleration_of(thrusters: ThrusterSet, mass: np.ndarray, passive: Sequence[int], alive: np.ndarray) -> np.ndarray:
+    """`Body.deceleration` (2,) of a body with this mass matrix (6, 6) and these passive axes, 0 to 5.
+
+    `alive`: (n,) bool, thrusters that may turn. An axis counts by the largest wrench that makes nothing along the others and is shared out
+    with the least forces: a thruster that is left out takes the force of its counterpart with it.
+    """
+    matrix = thrusters.matrix * alive
+    idle = {*passive, *axes_without_thrust(matrix, passive)}
+    pushed = [axis for axis in range(6) if axis not in idle]
+    shares = np.abs(np.linalg.pinv(matrix[pushed], rcond=RANK_TOLERANCE))
+    along = np.full(6, np.inf)
+    along[pushed] = 1.0 / (np.max(shares / (0.5 * (thrusters.f_max - thrusters.f_min))[:, None], axis=0) * np.diag(mass)[pushed])
+    return np.asarray(along.reshape(2, 3).min(axis=1))
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class DragTable:
     """Drag of a shape over flow direction, on the six sides of a cube (core.drag_lookup).
@@ -134,7 +149,7 @@ class Body:
         hull_m: (m, 3) edges of each module's hull, a box, along the axes of the body, m.
         reach_m: largest distance of any point of its hulls from the centre of mass, m.
         deceleration: (2,) with which all its thrusters stop its motion and its turn along the axis where that takes longest, m/s^2 and
-            rad/s^2; passive axes, and those without thrust, left out.
+            rad/s^2, see deceleration_of; passive axes, and those without thrust, left out.
         depth_rating_m: largest depth that all its vehicles are made for, m.
         cells: (m, 3) lattice cells; name: for display.
         faces: per module the kinds of its six faces, a letter each, as in the vehicle file (P probe, D drogue).

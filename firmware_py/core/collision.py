@@ -41,6 +41,7 @@ def times_to_brake(
     bodies: Sequence[Body],
     estimates: Mapping[int, Estimate],
     wanted_w: Mapping[int, np.ndarray],
+    deceleration: Mapping[int, np.ndarray],
     bandwidth: float,
     pairs: Collection[tuple[int, int]] = (),
 ) -> dict[int, float]:
@@ -50,6 +51,7 @@ def times_to_brake(
     Args:
         estimates: by number of the body. A body whose place is unknown is left out.
         wanted_w: by number, the (3,) velocity in the world that guidance wants, m/s.
+        deceleration: by number, (2,) that of the thrusters that are used, as Body.deceleration.
         bandwidth: with which the set-points come to rest, rad/s.
         pairs: numbers of two bodies each that are no obstacles to each other, because they dock or have just parted.
     """
@@ -68,12 +70,12 @@ def times_to_brake(
     r_w, v_w, cylinder = map(np.concatenate, zip(*modules, strict=True))
     wanted = np.array([wanted_w[number] for number in numbers])
     nu = np.array([estimates[number].nu for number in numbers]).reshape(len(placed), 2, 3)
-    deceleration = np.array([body.deceleration for body in placed])
+    slowing = np.array([deceleration[number] for number in numbers])
     own, asked = np.linalg.norm(nu, axis=2), np.zeros((len(placed), 2))
     asked[:, 0] = np.linalg.norm(wanted, axis=1)
     left = np.fmin(
-        _soonest(r_w, v_w, v_w, cylinder, of_body, ignored) - braking_s(own, deceleration, bandwidth),
-        _soonest(r_w, wanted[of_body], v_w, cylinder, of_body, ignored) - braking_s(asked, deceleration, bandwidth),
+        _soonest(r_w, v_w, v_w, cylinder, of_body, ignored) - braking_s(own, slowing, bandwidth),
+        _soonest(r_w, wanted[of_body], v_w, cylinder, of_body, ignored) - braking_s(asked, slowing, bandwidth),
     )
     return times | dict(zip(numbers, np.maximum(left, 0.0).tolist(), strict=True))
 

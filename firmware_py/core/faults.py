@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from firmware_py.core.body import Body, rank_by, rank_of
+from firmware_py.core.body import Body, deceleration_of, rank_by, rank_of
 from firmware_py.core.command_watch import CommandWatch
 from firmware_py.core.missing_thrust import MissingThrust
 from firmware_py.core.rotations import M, V
@@ -74,6 +74,8 @@ class ThrusterFaults(NamedTuple):
     """Rank lost from the thruster matrix because of unusable thrusters; passive axes do not count."""
     keep: np.ndarray
     """(6, 6) matrix that removes from a wrench its passive axes and what the usable thrusters cannot make."""
+    deceleration: np.ndarray
+    """(2,) that of the usable thrusters, as Body.deceleration."""
 
 
 def _keep(made: np.ndarray, lost: np.ndarray) -> np.ndarray:
@@ -106,7 +108,7 @@ class FaultDetector:
     def __init__(self, body: Body, parameters: Faults, period_ns: int) -> None:
         t = body.thrusters
         self._t = t
-        self._passive = list(body.passive)
+        self._mass, self._passive = body.mass, list(body.passive)
         self._thruster_at = by_channel(body)
         self._pair_at = [{c: (at.get(c, -1), at.get(c + 1, -1)) for c in range(max(at) + 1)} for at in self._thruster_at]
         """Per module and first channel of an ESC feedback: the indices of its two thrusters, -1 where there is none."""
@@ -337,7 +339,8 @@ class FaultDetector:
         dead = tuple(int(i) for i in np.flatnonzero(~alive))
         keep = _keep(u[:, :rank], u[:, rank:])
         keep[:, self._passive] = 0.0
-        return ThrusterFaults(alive, dead, self._rank - self._steered_rank(self._t.matrix * alive), keep)
+        lost_axes = self._rank - self._steered_rank(self._t.matrix * alive)
+        return ThrusterFaults(alive, dead, lost_axes, keep, deceleration_of(self._t, self._mass, self._passive, alive))
 
     def _steered_rank(self, matrix: np.ndarray) -> int:
         """Returns the rank of a (6, n) thruster matrix without its passive axes."""

@@ -74,6 +74,8 @@ class Guidance:
 
     def __init__(self, body: Body, parameters: Parameters) -> None:
         self._body = body
+        self.deceleration = body.deceleration
+        """(2,) that of the thrusters that are used, as Body.deceleration."""
         self._glider = Glider(0.0, 0.0, 0.0)
         self.retune(parameters)
         self._trajectory: Trajectory | None = None
@@ -111,8 +113,6 @@ class Guidance:
         self._no_place_s, self._no_depth_s = f.tag_lost_limit, f.depth_unknown_limit
         self._most_push_m_s = f.pushed_limit if f.pushed_action > Level.WARN else math.inf
         self._least_s = f.collision_limit if f.collision_action >= Level.HOLD else 0.0
-        # least time to a place, so that the fail-safe `collision` permits one just before another body
-        self._arrival_s = f.collision_limit + float(braking_s(np.array([p.speed_m_s, 0.0]), self._body.deceleration, p.bandwidth))
         self._full_stick = p.stick_share * self._body.thrusters.full_wrench
         self._lift_n = p.surface_force_n * len(self._body.modules)
         depth_m = self._body.r_bm[:, 2]
@@ -318,7 +318,9 @@ class Guidance:
         self.wanted_w = wish.v_w
         if wish.p_wb is not None:
             way = np.nan_to_num(wish.p_wb - self._glider.at.p_wb)
-            self.wanted_w = wish.v_w + way / max(self._arrival_s, float(np.linalg.norm(way)) / self._p.speed_m_s)
+            # least time to a place, so that the fail-safe `collision` permits one just before another body
+            arrival_s = self._least_s + float(braking_s(np.array([self._p.speed_m_s, 0.0]), self.deceleration, self._p.bandwidth))
+            self.wanted_w = wish.v_w + way / max(arrival_s, float(np.linalg.norm(way)) / self._p.speed_m_s)
         return REST if health.collision_s < self._least_s else wish
 
     def _guided(self, time_ns: int) -> Wish:

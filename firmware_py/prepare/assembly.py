@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_py.core import rotations
-from firmware_py.core.body import ARM_SIGMA_M, BUOYANCY_SIGMA_N, TRIM_SIGMA_M, Body, ThrusterSet, axes_without_thrust, can_make
+from firmware_py.core.body import ARM_SIGMA_M, BUOYANCY_SIGMA_N, TRIM_SIGMA_M, Body, ThrusterSet, can_make, deceleration_of
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import AXES, MOST_THRUSTERS, Vehicle, too_many_thrusters
@@ -143,17 +143,10 @@ def _body(placements: Sequence[Placement], modules: tuple[int, ...], pitch_m: fl
         supply_power_w=np.array([_power(p.vehicle) for p in placements]),
         hull_m=np.array([np.abs(MATRICES[p.rotation] @ p.vehicle.hull.size_m) for p in placements]),
         reach_m=max(_reach_m(p.vehicle, r) for p, r in zip(placements, r_bm, strict=True)),
-        deceleration=_deceleration(thrusters, mass, passive),
+        deceleration=deceleration_of(thrusters, mass, passive, np.ones(thrusters.f_max.size, dtype=np.bool_)),
         passive=passive,
         depth_rating_m=min(p.vehicle.depth_rating_m for p in placements),
     )
-
-
-def _deceleration(thrusters: ThrusterSet, mass: np.ndarray, passive: Sequence[int]) -> np.ndarray:
-    """`Body.deceleration` (2,) of a body with this mass matrix (6, 6) and these passive axes, 0 to 5."""
-    along = thrusters.full_wrench / np.diag(mass)
-    along[[*passive, *axes_without_thrust(thrusters.matrix, passive)]] = np.inf
-    return np.asarray(along.reshape(2, 3).min(axis=1))
 
 
 def passive_axes(fleet: Fleet, members: Sequence[int], vehicles: Mapping[str, Vehicle]) -> tuple[int, ...]:

@@ -7,13 +7,14 @@ from itertools import product
 
 import numpy as np
 import pytest
+from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
-from firmware_py.core.body import Body
+from firmware_py.core.body import Body, deceleration_of
 from firmware_py.core.collision import CLOSING_M_S, OWN_M_S, braking_s, in_world, times_to_brake, within
 from firmware_py.core.rotations import from_euler, rotate_back
 from firmware_py.core.setpoint import REST, Glider
-from firmware_py.core.types import NEVER_AGE_NS, Action, Estimate, Mode, Request, Setpoint, Sticks
+from firmware_py.core.types import NEVER_AGE_NS, Action, EscFeedback, Estimate, Mode, Request, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble, assemble_vehicle
@@ -40,12 +41,23 @@ def at(place: Sequence[float], velocity: Sequence[float] = (0.0, 0.0, 0.0), turn
     return here._replace(**changes)
 
 
+def times_of(
+    bodies: Sequence[Body],
+    estimates: dict[int, Estimate],
+    wanted_w: dict[int, np.ndarray],
+    bandwidth: float,
+    pairs: Sequence[tuple[int, int]] = (),
+) -> dict[int, float]:
+    """Times to brake of bodies whose thrusters all turn."""
+    return times_to_brake(bodies, estimates, wanted_w, {body.index: body.deceleration for body in bodies}, bandwidth, pairs)
+
+
 def pair(
     first: Estimate, second: Estimate, pairs: tuple[tuple[int, int], ...] = (), wanted: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> tuple[float, float]:
     """Times of bodies 0 and 5; `wanted`: velocity that the guidance of body 0 wants."""
     bodies = [single(0), single(5)]
-    times_s = times_to_brake(bodies, {0: first, 5: second}, {0: np.array(wanted), 5: ZERO}, math.inf, pairs)
+    times_s = times_of(bodies, {0: first, 5: second}, {0: np.array(wanted), 5: ZERO}, math.inf, pairs)
     return times_s[0], times_s[5]
 
 
@@ -120,7 +132,7 @@ def test_time_within_reach_is_that_of_a_parabola_below_zero() -> None:
 def test_hull_that_grazes_another_touches_it() -> None:
     hulls = [dataclasses.replace(single(number), hull_m=np.array([[0.6, 0.8, 0.4]])) for number in (0, 5)]
     estimates = {0: at([0.0, 0.0, 1.0], [0.5, 0.0, 0.0]), 5: at([2.0, 1.0, 1.0])}
-    assert times_to_brake(hulls, estimates, {0: ZERO, 5: ZERO}, math.inf)[0] == 4.0
+    assert times_of(hulls, estimates, {0: ZERO, 5: ZERO}, math.inf)[0] == 4.0
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -137,7 +149,7 @@ def test_times_of_many_bodies_are_those_of_small_steps(seed: int) -> None:
     }
     seen = [in_world(*estimates[body.index][:3], body.r_bm, body.hull_m) for body in bodies]
     t = np.arange(0.0, 12.0, 1e-3)[:, None]
-    times = times_to_brake(bodies, estimates, {body.index: ZERO for body in bodies}, math.inf)
+    times = times_of(bodies, estimates, {body.index: ZERO for body in bodies}, math.inf)
 
     def first_touch(i: int) -> float:
         firsts = [math.nan]
@@ -212,14 +224,14 @@ def test_corner_of_a_turning_row_counts_with_its_own_speed() -> None:
     row, other = at_once(assemble([(-1, 0, 0), (0, 0, 0), (1, 0, 0)], [0] * 3, [MODCUBE] * 3, [1, 2, 3])), single(8)
     turning = at([0.0, 0.0, 1.0], turn=1.0)
     estimates = {1: turning, 8: at([PITCH_M, 0.6, 1.0])}
-    times = times_to_brake([row, other], estimates, {1: ZERO, 8: ZERO}, math.inf)
+    times = times_of([row, other], estimates, {1: ZERO, 8: ZERO}, math.inf)
     assert times[1] == pytest.approx((0.6 - TOUCH_M) / PITCH_M, rel=1e-6)
     assert math.isnan(times[8])
 
 
 def test_vehicle_alone_has_nobody_to_meet() -> None:
     alone = at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0])
-    assert math.isnan(times_to_brake([assemble_vehicle(MODCUBE)], {0: alone}, {0: np.array([0.2, 0.0, 0.0])}, 6.0)[0])
+    assert math.isnan(times_of([assemble_vehicle(MODCUBE)], {0: alone}, {0: np.array([0.2, 0.0, 0.0])}, 6.0)[0])
 
 
 @pytest.mark.parametrize(("speed", "bandwidth"), [(0.1, 6.0), (0.3, 1.0), (1.0, 6.0), (2.0, 30.0)])
@@ -240,10 +252,10 @@ def test_time_to_brake_is_that_to_the_collision_less_the_braking() -> None:
     bodies = [assemble([(0, 0, 0)], [0], [MODCUBE], [number]) for number in (0, 5)]
     estimates = {0: at(ZERO, [0.2, 0.0, 0.0]), 5: at([1.0, 0.0, 0.0])}
     alone_s = (1.0 - TOUCH_M) / 0.2 - braking_s(np.array([0.2, 0.0]), bodies[0].deceleration, 6.0)
-    assert times_to_brake(bodies, estimates, {0: ZERO, 5: ZERO}, 6.0)[0] == pytest.approx(alone_s)
+    assert times_of(bodies, estimates, {0: ZERO, 5: ZERO}, 6.0)[0] == pytest.approx(alone_s)
     wanted_s = (1.0 - TOUCH_M) / 0.4 - braking_s(np.array([0.4, 0.0]), bodies[0].deceleration, 6.0)
-    assert times_to_brake(bodies, estimates, {0: np.array([0.4, 0.0, 0.0]), 5: ZERO}, 6.0)[0] == pytest.approx(wanted_s)
-    assert times_to_brake(bodies, estimates, {0: ZERO, 5: ZERO}, 0.1)[0] == 0.0, "it brakes too late"
+    assert times_of(bodies, estimates, {0: np.array([0.4, 0.0, 0.0]), 5: ZERO}, 6.0)[0] == pytest.approx(wanted_s)
+    assert times_of(bodies, estimates, {0: ZERO, 5: ZERO}, 0.1)[0] == 0.0, "it brakes too late"
 
 
 def test_deceleration_is_that_of_the_weakest_axis_which_is_steered() -> None:
@@ -254,9 +266,26 @@ def test_deceleration_is_that_of_the_weakest_axis_which_is_steered() -> None:
     assert body.deceleration[0] < 4.0 * full_n / body.mass[2, 2]
     rov = assemble_vehicle(load_vehicle("bluerov2"))
     along = rov.thrusters.full_wrench / np.diag(rov.mass)
-    assert rov.passive == (4,) and rov.deceleration[1] == pytest.approx(min(along[3], along[5]))
+    assert rov.passive == (4,) and 0.85 * min(along[3], along[5]) < rov.deceleration[1] < min(along[3], along[5])
     undeclared = assemble_vehicle(dataclasses.replace(load_vehicle("bluerov2"), passive_dof=()))
     assert undeclared.deceleration.tolist() == rov.deceleration.tolist()
+
+
+@pytest.mark.parametrize("out", range(8))
+def test_thruster_that_is_left_out_takes_the_force_of_its_counterpart_with_it(out: int) -> None:
+    """Against the allocation itself: no stronger than what the seven others can do along the weakest axis, and not much weaker."""
+    body = assemble_vehicle(MODCUBE)
+    t, alive = body.thrusters, np.arange(8) != out
+    most = np.where(alive, 0.5 * (t.f_max - t.f_min), 0.0)
+    no_force = np.zeros(8)
+    able = [
+        -linprog(np.r_[no_force, -1.0], None, None, np.c_[t.matrix, -axis], np.zeros(6), [*zip(-most, most, strict=True), (0, None)]).fun
+        for axis in np.eye(6)
+    ]
+    move, turn = (np.array(able) / np.diag(body.mass)).reshape(2, 3).min(axis=1)
+    found = deceleration_of(t, body.mass, (), alive)
+    assert 0.9 * move < found[0] <= move * (1.0 + 1e-9) and found[0] < 0.7 * body.deceleration[0]
+    assert 0.6 * turn < found[1] <= turn * (1.0 + 1e-9) and found[1] < 0.9 * body.deceleration[1]
 
 
 def test_body_without_any_thrust_along_an_axis_brakes_along_the_others() -> None:
@@ -264,7 +293,7 @@ def test_body_without_any_thrust_along_an_axis_brakes_along_the_others() -> None
     half = dataclasses.replace(MODCUBE, thruster=MODCUBE.thruster[:4])
     bodies = [assemble([(0, 0, 0)], [0], [half], [number]) for number in (0, 5)]
     assert all(bodies[0].deceleration > 0.0) and np.isfinite(bodies[0].deceleration[0])
-    times_s = times_to_brake(bodies, {0: at(ZERO), 5: at([1.0, 0.0, 0.0])}, {0: np.array([0.4, 0.0, 0.0]), 5: ZERO}, 6.0)
+    times_s = times_of(bodies, {0: at(ZERO), 5: at([1.0, 0.0, 0.0])}, {0: np.array([0.4, 0.0, 0.0]), 5: ZERO}, 6.0)
     assert 0.0 < times_s[0] < (1.0 - TOUCH_M) / 0.4
 
 
@@ -306,6 +335,25 @@ def test_body_that_is_fast_or_changes_speed_slowly_brakes_sooner(speed_m_s: floa
     tank.run(12.0, Request(Action.HOLD, 0, Setpoint(np.array([4.0, 0.0, 0.8]), LEVEL, ZERO, ZERO, ZERO, ZERO)))
     assert tank.when("fail-safe on: another body is in the way")
     assert distances(tank).min() > TOUCH_M and np.linalg.norm(tank.states[0][7:10]) < 0.01
+
+
+@pytest.mark.slow
+def test_body_with_a_dead_thruster_brakes_by_those_that_are_left() -> None:
+    """Regression: it counted all of them, and swam 0.1 m into the other."""
+    tank = two_in_the_water(Parameters().replace("steering.speed_m_s", 2.0), from_m=-2.5)
+    escs, move = tank._escs, tank._move
+
+    def failed_escs(n: int, k: int) -> list[EscFeedback]:
+        return [esc._replace(status=(1, 0)) if (n, esc.first) == (0, 2) else esc for esc in escs(n, k)]
+
+    def moved(n: int) -> None:
+        tank.acting[0][0, 2] = 0.0
+        move(n)
+
+    tank._escs, tank._move = failed_escs, moved  # type: ignore[method-assign]
+    tank.run(10.0, Request(Action.HOLD, 0, Setpoint(np.array([4.0, 0.0, 0.8]), LEVEL, ZERO, ZERO, ZERO, ZERO)))
+    assert tank.outputs[-1].records[0].mode == Mode.POSHOLD and tank.when("fail-safe on: another body is in the way")
+    assert distances(tank).min() > TOUCH_M
 
 
 @pytest.mark.slow

@@ -66,7 +66,8 @@ class MonitorBench:
         estimate = estimate._replace(**{k: v for k, v in more.items() if k in Estimate._fields})  # type: ignore[arg-type]
         self.monitor.pressure_heard = any(module.pressure_pa is not None for module in (modules[1], modules[3]))
         inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped, **self.foreign)
-        return self.monitor.step(inputs, estimate, list(requests), ThrusterFaults(np.ones(self.count, dtype=bool), (), 0, np.eye(6)))
+        faults = ThrusterFaults(np.ones(self.count, dtype=bool), (), 0, np.eye(6), np.ones(2))
+        return self.monitor.step(inputs, estimate, list(requests), faults)
 
     def wait(self, seconds: float, **more: object) -> Health:
         for _ in range(round(seconds / 0.01)):
