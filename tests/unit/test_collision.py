@@ -18,7 +18,7 @@ from firmware_py.core.types import NEVER_AGE_NS, Action, EscFeedback, Estimate, 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble, assemble_vehicle
-from tests.unit.tanks import MODCUBE, FaultyTank
+from tests.unit.tanks import MODCUBE, FaultyTank, world
 
 EDGE_M = float(MODCUBE.hull.size_m[0])
 TOUCH_M = EDGE_M * 2.0**0.5
@@ -375,6 +375,22 @@ def test_body_that_is_sent_on_and_on_waits_and_goes_on_when_the_way_is_free(insi
     for _ in range(80):
         tank.run(0.1, *asked)
     assert tank.states[0][0] > 2.0 and distances(tank).min() > EDGE_M + 0.05
+
+
+@pytest.mark.slow
+def test_row_of_nine_that_turns_fast_stops_before_another() -> None:
+    """Regression: it counted as if every thruster gave all its force to the turn, and stopped 0.26 m from the other's middle."""
+    tank = FaultyTank([(i, 0, 0) for i in range(10)], Parameters().replace("steering.rate_rad_s", 1.5), each=9)
+    for state, place in zip(tank.states, ((0.0, 0.0), (0.42, 0.42 * 3.0**0.5)), strict=True):
+        state[:7] = [*place, 1.5, *LEVEL]
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 9))
+    round_about = Setpoint(np.array([0.0, 0.0, 1.5]), from_euler(0.0, 0.0, 3.05), ZERO, ZERO, ZERO, ZERO)
+    tank.run(3.0, Request(Action.HOLD, 0, round_about))
+    assert tank.when("fail-safe on: another body is in the way")
+    row = tank.bodies[0].r_bm
+    gaps_m = [np.linalg.norm(states[0][:3] + world(states[0]).apply(row) - states[1][:3], axis=1).min() for states in tank.past]
+    assert min(gaps_m) > TOUCH_M
 
 
 @pytest.mark.slow
