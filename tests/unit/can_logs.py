@@ -1,6 +1,9 @@
 """Lines that the process of a vehicle of three modules writes into its can.log, made of the codec's own frames."""
 
+import dataclasses
 from collections.abc import Sequence
+
+import numpy as np
 
 from firmware_py.bus.codec import Codec
 from firmware_py.description.fleet import Fleet, Module
@@ -9,6 +12,14 @@ from firmware_py.runtime.recorder import candump_lines
 CODEC = Codec.load()
 FLEET = Fleet(module=(Module(number=1), Module(number=2), Module(number=1, bus=1)), buses=("virtual:a", "virtual:b"))
 PERIOD_NS = 10_000_000
+
+
+def docked(first: int, second: int) -> tuple[Module, ...]:
+    """The fleet's modules, of which two start docked."""
+    modules = list(FLEET.module)
+    for x, index in enumerate((first, second)):
+        modules[index] = dataclasses.replace(modules[index], body=0, cell=np.array([x, 0, 0]))
+    return tuple(modules)
 
 
 def lines_of(armed: Sequence[bool], tick: int = 1) -> str:

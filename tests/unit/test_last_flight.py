@@ -7,11 +7,25 @@ from typing import Any
 
 import pytest
 
-from firmware_py.app.last_flight import RECENT_NS, TAIL_BYTES, LastFlight, last_flight, outdate
+from firmware_py.app.firmware import compose
+from firmware_py.app.last_flight import (
+    DOCKED_SINCE,
+    PARTED_SINCE,
+    RECENT_NS,
+    STOPPED,
+    TAIL_BYTES,
+    TESTED,
+    LastFlight,
+    last_flight,
+    outdate,
+    to_arm,
+)
+from firmware_py.description.fleet import Fleet
+from firmware_py.description.parameters import Parameters, Supervision
 from firmware_py.runtime.clock import unix_ns
 from firmware_py.runtime.guarded_file import GuardedFile, QueuedFile
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
-from tests.unit.can_logs import CODEC, FLEET, dock_line, lines_of
+from tests.unit.can_logs import CODEC, FLEET, dock_line, docked, lines_of
 
 BOOT = "a-start-of-the-machine"
 
@@ -208,3 +222,41 @@ def test_end_of_the_log_holds_a_dock_cmd_of_every_module(tmp_path: Path, rate_hz
     tick = lines_of([True] * 3) + "(0000000000.010000) can0 0C1#0011223344556677 R\n" * 14
     write(tmp_path, "".join(dock_line(i, (1,) * 6) for i in range(3)) + tick * every)
     assert len(found(tmp_path).pulling) == 18
+
+
+# ---------------------------------------------------------------- who is armed without a person
+
+FLOWN = LastFlight(frozenset({0, 2}))
+PAIR = Fleet(module=docked(0, 1), buses=FLEET.buses)
+JOINT = frozenset({(0, 0), (1, 1)})
+"""Face A of the first module and face B of the second."""
+HOLDS, ALL = "the process before ended in flight", {0, 1, 2}
+
+
+@pytest.mark.parametrize(("before", "fleet", "hold", "rearm", "armed", "told"), [
+    (FLOWN, FLEET, False, False, set(), []),
+    (FLOWN, FLEET, False, True, {0, 2}, [HOLDS]),
+    (FLOWN, FLEET, True, False, ALL, []),
+    (FLOWN, FLEET, True, True, ALL, []),
+    (LastFlight(), FLEET, False, True, set(), []),
+    (FLOWN._replace(stopped=True), FLEET, False, False, set(), []),
+    (FLOWN._replace(stopped=True), FLEET, False, True, set(), [STOPPED]),
+    (FLOWN._replace(stopped=True), FLEET, True, False, set(), [STOPPED]),
+    (FLOWN._replace(pulling=JOINT), FLEET, False, True, set(), [DOCKED_SINCE]),
+    (FLOWN._replace(pulling=JOINT), FLEET, True, False, ALL, [DOCKED_SINCE]),
+    (FLOWN._replace(pulling=JOINT), PAIR, False, True, {0, 2}, [HOLDS]),
+    (FLOWN._replace(let_go=JOINT), FLEET, False, True, {0, 2}, [HOLDS]),
+    (FLOWN._replace(let_go=JOINT), PAIR, False, True, set(), [PARTED_SINCE]),
+    (FLOWN._replace(let_go=JOINT), PAIR, True, False, set(), [PARTED_SINCE]),
+    (FLOWN._replace(grounded=frozenset({2})), FLEET, False, True, {0}, [TESTED, HOLDS]),
+    (FLOWN._replace(grounded=frozenset({1})), FLEET, False, True, {0, 2}, [HOLDS]),
+    (FLOWN._replace(grounded=frozenset({0, 2})), FLEET, False, True, set(), [TESTED]),
+    (LastFlight(frozenset({0, 1, 2}), grounded=frozenset({0})), PAIR, False, True, {2}, [TESTED, HOLDS]),
+])  # fmt: skip
+def test_nobody_is_armed_without_a_person_unless_it_is_sure(
+    before: LastFlight, fleet: Fleet, hold: bool, rearm: bool, armed: set[int], told: list[str]
+) -> None:
+    said: list[str] = []
+    firmware = compose(fleet, Parameters(supervision=Supervision(rearm=int(rearm))))
+    assert to_arm(before, firmware, hold, said.append) == armed
+    assert [words in line for words, line in zip(told, said, strict=True)] == [True] * len(told)

@@ -1,11 +1,9 @@
 """A vehicle's process that was killed in flight holds again, but arms no body whose joints may have changed."""
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from firmware_py.app import vehicle_process
@@ -16,7 +14,7 @@ from firmware_py.description.parameters import Parameters, Supervision
 from firmware_py.runtime.clock import boot_id
 from firmware_py.runtime.recorder import CAN_LOG, Recorder
 from firmware_py.runtime.tick_messages import Message, TickMessages
-from tests.unit.can_logs import FLEET, dock_line, lines_of
+from tests.unit.can_logs import FLEET, dock_line, docked, lines_of
 from tests.unit.vehicle_runs import bus_of, fly
 
 REARM = Parameters(supervision=Supervision(rearm=1))
@@ -71,14 +69,6 @@ APART = (
     "warning: modules 1 on {bus}, 2 on {bus} were docked, or about to be, and their magnets let go: "
     "the fleet file has to say so (body, cell) before they fly as one or REARM arms them"
 )
-
-
-def docked(first: int, second: int) -> tuple[Module, ...]:
-    """The fleet's modules, of which two start docked."""
-    modules = list(FLEET.module)
-    for x, index in enumerate((first, second)):
-        modules[index] = dataclasses.replace(modules[index], body=0, cell=np.array([x, 0, 0]))
-    return tuple(modules)
 
 
 @pytest.mark.slow
