@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -167,13 +168,26 @@ class MissionFlight:
         return ""
 
     def set_speed(self, speed_m_s: float) -> str:
-        """Sets the speed of flights planned from now on; -1: unchanged, -2: the parameter's. Returns why not, or an empty text."""
-        wanted = {SPEED_STAYS: self._speed, SPEED_DEFAULT: None}.get(speed_m_s, speed_m_s)
+        """Sets the speed from here on, up to the mission's next change of speed: a flight under way is planned anew from where the body is.
+
+        Args:
+            speed_m_s: -1: unchanged; -2: the parameter's.
+
+        Returns why not, or an empty text.
+        """
+        if speed_m_s == SPEED_STAYS:
+            return ""
+        wanted = None if speed_m_s == SPEED_DEFAULT else speed_m_s
         if wanted is not None and not SLOWEST <= wanted <= FASTEST:
             return _no_speed(wanted)
-        before, self._speed = self._cruise, wanted
-        if self._flight is not None and self._cruise != before:
-            self._system.say(NOTICE, f"{self._cruise:g} m/s from the next flight on; the one under way keeps its speed")
+        self._end_if_taken()
+        self._speed, self._remaining_legs = wanted, _at_another_speed(self._remaining_legs)
+        flight = self._flight
+        if flight is not None and self._is_on_its_way(flight):
+            legs = _at_another_speed(flight.left(self._flown_s(flight)))
+            if self._plan_inputs(legs)[-len(legs) :] != flight.plan_inputs[-len(legs) :]:
+                self._system.say(NOTICE, f"{self._cruise:g} m/s: the way from here is planned anew")
+                self._begin(legs, flight.replaced)
         return ""
 
     def go_to(self, latitude_deg: float, longitude_deg: float, altitude_m: float, yaw: float, speed_m_s: float) -> str:
@@ -333,23 +347,33 @@ class MissionFlight:
         while self._repeat and self._repeat[0][1] <= time_ns:
             self._system.broadcast("MISSION_ITEM_REACHED", {"seq": self._repeat.pop(0)[0]})
 
-    def _begin(self, legs: Sequence[Leg]) -> None:
+    def _begin(self, legs: Sequence[Leg], replaced: bool = False) -> None:
         if self._flies_already(legs):
             return
         s = self._system.subject
         self._system.ask(Action.SET_MODE, Mode.POSHOLD)
         changes, members = self._system.task_changes, s.picture.members(s.body)
-        self._flight = Flight(tuple(legs), self._plan_inputs(legs), s.picture.ticks, task_changes=changes, members=members)
+        inputs, tick = self._plan_inputs(legs), s.picture.ticks
+        self._flight = Flight(tuple(legs), inputs, tick, task_changes=changes, members=members, replaced=replaced)
 
     def _end(self, state: int) -> None:
         flight, self._flight = self._flight, None
         self.jobs.clear()
         if flight is not None and flight.of_mission and not flight.replaced:
             s = self._system.subject
-            t_s = 0.0 if flight.started_ns is None else (s.picture.time_ns - flight.started_ns) / NS_PER_S
-            self._remaining_legs, s.progress.state = flight.left(t_s), state
+            self._remaining_legs, s.progress.state = flight.left(self._flown_s(flight)), state
             if state == PAUSED:
                 s.progress.current = self._remaining_legs[0].sequence
+
+    def _flown_s(self, flight: Flight) -> float:
+        """Time since the body began to follow the flight's plan; 0 before."""
+        return 0.0 if flight.started_ns is None else (self._system.subject.picture.time_ns - flight.started_ns) / NS_PER_S
+
+    def _is_on_its_way(self, flight: Flight) -> bool:
+        """Whether the body still has the flight for its task, also where the next tick would only find out."""
+        s = self._system.subject
+        tracks = flight.started_ns is None or (s.armed and s.picture.mode(s.body) == Mode.AUTO)
+        return tracks and self._system.task_changes == flight.task_changes
 
     @property
     def _first(self) -> int:
@@ -377,6 +401,12 @@ class MissionFlight:
             if item.command == LOITER_UNLIMITED:
                 break
         return tuple(legs)
+
+
+def _at_another_speed(legs: Sequence[Leg]) -> tuple[Leg, ...]:
+    """The legs with the speed that was set last, up to the next change of speed among them."""
+    alike = list(takewhile(lambda leg: np.array_equal(leg.speed_m_s, legs[0].speed_m_s, equal_nan=True), legs))
+    return (*(leg._replace(speed_m_s=math.nan) for leg in alike), *legs[len(alike) :])
 
 
 def _no_speed(speed_m_s: float) -> str:

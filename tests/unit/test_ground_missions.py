@@ -5,6 +5,7 @@ import pytest
 from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.core.types import Action, Mode
+from firmware_py.description.parameters import Parameters
 from firmware_py.ground.config import GroundConfig
 from tests.unit.ground_missions import PLACES, continued, fly, item, plan_of, upload
 from tests.unit.ground_requests import NAN
@@ -274,19 +275,67 @@ def test_jump_that_comes_again_because_its_answer_was_lost_flies_on(
     assert [leg.sequence for leg in job.legs] == [1, 2], "once the item is reached it is gone back to"
 
 
-def test_jump_to_the_item_that_is_flown_to_takes_up_another_speed(world: World, client: Client) -> None:
-    """The flight under way keeps its speed, and a person who asks for another is told so: the answer is ACCEPTED."""
+@pytest.mark.parametrize("seconds", [0, 5, 12])
+def test_speed_that_is_set_in_flight_counts_from_there(world: World, client: Client, seconds: int) -> None:
+    """Regression: it counted from the next flight on."""
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     client.command(178, 1, 0.2)
     fly(world, client)
     assert "m/s" not in client.texts
+    world.run(100 * seconds)
     client.command(178, 1, 0.3)
-    world.run(2)
-    assert "0.3 m/s from the next flight on; the one under way keeps its speed" in client.texts
-    client.command(224, -1)
+    world.run(10)
+    assert "0.3 m/s: the way from here is planned anew" in client.texts
+    (job,) = world.station.jobs()
+    assert [(leg.sequence, leg.speed_m_s) for leg in job.legs] == [(i, pytest.approx(0.3)) for i in range(seconds // 10, 3)]
+    assert np.array_equal(job.p_wb, world.robot.p_wb[0])
+    world.station.planned(0, plan_of(job))
+    world.run(3)
+    for same in (0.3, -1):
+        client.command(178, 1, same)
+    world.run(10)
+    assert world.station.jobs() == [] and world.robot.mode[0] == Mode.AUTO, "the same speed stops no body"
+    client.command(178, 1, -2)
     world.run(10)
     (job,) = world.station.jobs()
-    assert [leg.speed_m_s for leg in job.legs] == [pytest.approx(0.3)] * 3
+    assert {leg.speed_m_s for leg in job.legs} == {Parameters().ground.mission_speed_m_s}
+
+
+@pytest.mark.parametrize("paused", [False, True])
+def test_speed_that_is_set_replaces_that_of_an_item_passed_up_to_the_next_such_item(world: World, client: Client, paused: bool) -> None:
+    slow, fast = (item(i, (0, 0, 0), command=178, frame=2, p=(1, speed, -1, 0)) for i, speed in ((0, 0.1), (3, 0.5)))
+    upload(world, client, [slow, item(1, PLACES[0]), item(2, PLACES[1]), fast, item(4, PLACES[2])])
+    fly(world, client)
+    if paused:
+        client.command(193, 0)
+        world.run(20)
+    client.command(178, 1, 0.3)
+    if paused:
+        client.command(193, 1)
+    world.run(10)
+    (job,) = world.station.jobs()
+    assert [leg.speed_m_s for leg in job.legs] == pytest.approx([0.3, 0.3, 0.5])
+
+
+def test_speed_that_is_set_does_not_take_a_body_back_from_a_hold(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    client.command(193, 0)
+    client.command(178, 1, 0.3)
+    world.run(10)
+    assert world.station.jobs() == [] and world.robot.mode[0] == Mode.POSHOLD
+
+
+def test_mission_that_was_replaced_flies_on_at_another_speed_and_reports_nothing(world: World, client: Client) -> None:
+    upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
+    fly(world, client)
+    upload(world, client, [item(i, PLACES[0]) for i in range(2)])
+    client.command(178, 1, 0.3)
+    world.run(10)
+    (job,) = world.station.jobs()
+    world.station.planned(0, plan_of(job))
+    world.run(1100)
+    assert len(job.legs) == 3 and not client.all("MISSION_ITEM_REACHED")
 
 
 def test_jump_after_the_same_mission_was_sent_anew_flies_the_new_one(world: World, client: Client) -> None:
