@@ -13,6 +13,7 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
+from firmware_py.description.vehicle import AXES
 from firmware_py.prepare.piecewise import Piecewise
 from firmware_py.prepare.snap_limits import InfeasibleError, Limits, Place, crests, planes, solve_limited, worst
 from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
@@ -324,8 +325,9 @@ class _Request:
             raise InfeasibleError("neither thrusters nor buoyancy keep the robot from falling over", place(int(falling[0])))
         lean, k = _largest(part.lean.reshape(-1, run))
         if lean > MOST_LEAN:
-            degrees = f"{math.degrees(lean):.1f} deg, of at most {math.degrees(MOST_LEAN):.1f} deg"
-            raise InfeasibleError(f"the robot would lean by {degrees}, for a moment that its thrusters do not give,", place(k))
+            degrees, name = f"{math.degrees(lean):.1f} deg, of at most {math.degrees(MOST_LEAN):.1f} deg", AXES[part.axis[k]]
+            rest = f"; keep it level in {name} there" if place(k).time_s is None else ""
+            raise InfeasibleError(f"its thrusters give no {name}: the robot would lean by {degrees},", place(k), rest)
         share, k = usage(body, part.thrust, self.limits.thruster_share, sag(part.thrust, run))
         if share > self.limits.thruster_share:
             raise InfeasibleError(_thrust_message(share, self.limits.thruster_share), place(k))

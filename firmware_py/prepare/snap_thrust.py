@@ -37,11 +37,13 @@ class Division:
         thrust: (k, 6) wrench left to the thrusters, within their span, N and N m.
         lean: (k,) rad by which the body leans from the reference attitude until this wrench suffices; infinite where
             nothing keeps it from falling over.
+        axis: (k,) index in AXES of the moment that leaning mainly stands in for.
         lacking: (k, 6) wrench that neither supplies; zero for motion that the body can fly.
     """
 
     thrust: np.ndarray
     lean: np.ndarray
+    axis: np.ndarray
     lacking: np.ndarray
 
 
@@ -79,7 +81,7 @@ def divide(body: Body, motion: np.ndarray) -> Division:
     left, sizes, _ = np.linalg.svd(body.steered_matrix)
     outside = left[:, rank_by(sizes) :]
     if not outside.size:
-        return Division(wanted, np.zeros(len(wanted)), np.zeros_like(wanted))
+        return Division(wanted, np.zeros(len(wanted)), np.full(len(wanted), 3), np.zeros_like(wanted))
     slope = np.stack([_change_by_lean(body, motion, axis) for axis in outside[3:].T], axis=2)
     stiffness = outside.T @ slope
     stiffness[np.abs(stiffness).max(axis=(1, 2)) < _NO_STIFFNESS] = 0.0
@@ -88,9 +90,10 @@ def divide(body: Body, motion: np.ndarray) -> Division:
     lacking = thrust @ outside @ outside.T
     thrust -= lacking
     lacking[~_matters(lacking, wanted)] = 0.0
-    lean = np.linalg.norm((outside[3:] @ s)[..., 0], axis=1)
+    leaning = (outside[3:] @ s)[..., 0]
+    lean = np.linalg.norm(leaning, axis=1)
     lean[np.linalg.eigvalsh(stiffness + np.swapaxes(stiffness, 1, 2)).min(axis=1) < -_NO_STIFFNESS] = np.inf
-    return Division(thrust, lean, lacking)
+    return Division(thrust, lean, 3 + np.argmax(np.abs(leaning), axis=1), lacking)
 
 
 def _change_by_lean(body: Body, motion: np.ndarray, axis: np.ndarray) -> np.ndarray:

@@ -148,7 +148,7 @@ def test_vehicle_with_all_six_axes_leaves_nothing_to_buoyancy() -> None:
 @pytest.mark.parametrize(
     ("q_wb", "message"),
     [
-        (rotations.from_euler(0.0, 0.5, 0.0), r"lean by 31.3 deg, of at most 11.5 deg, .* on the way to item 0"),
+        (rotations.from_euler(0.0, 0.5, 0.0), "no pitch: the robot would lean by 31.3 deg, .* 11.5 deg, on the way to item 0; "),
         (rotations.from_euler(math.pi, 0.0, 0.0), "keep the robot from falling over on the way to item 0"),
         (rotations.from_euler(math.pi, 0.1, 0.0), "keep the robot from falling over on the way to item 0"),
     ],
@@ -158,6 +158,16 @@ def test_attitude_that_neither_thrusters_nor_buoyancy_hold_is_refused(bluerov2: 
     found = plan_mission(job(NORTH, q_wb=q_wb), bluerov2)
     assert found.trajectory is None
     assert re.search(message, found.reason)
+
+
+def test_refusal_of_an_attitude_that_cannot_be_held_says_what_to_change(bluerov2: Body) -> None:
+    """Regression: it spoke of a moment that the thrusters do not give, and named neither the axis nor a remedy."""
+    for vehicle, attitude, axis in ((bluerov2, (0.0, 0.35, 0.6), "pitch"), ("girona500", (0.35, 0.0, 0.6), "roll")):
+        body = assemble_vehicle(load_vehicle(vehicle)) if isinstance(vehicle, str) else vehicle
+        with pytest.raises(InfeasibleError) as refused:
+            plan([Waypoint(START), Waypoint(NORTH, rotations.from_euler(*attitude))], body=body)
+        degrees = "the robot would lean by 20.9 deg, of at most 11.5 deg, to stand still at waypoint 1"
+        assert str(refused.value) == f"its thrusters give no {axis}: {degrees}; keep it level in {axis} there"
 
 
 def test_push_along_an_axis_without_thrusters_is_refused_at_any_speed(bluerov2: Body) -> None:
@@ -198,7 +208,7 @@ def test_lean_is_checked_between_the_points_where_it_is_looked_at(bluerov2: Body
     path = plan(waypoints, 30.19)
     at_points, between = (divide(bluerov2, path.grid(points)[..., :19].reshape(-1, 19)).lean.max() for points in (48, 2000))
     assert at_points < MOST_LEAN < between
-    with pytest.raises(InfeasibleError, match=r"lean by 11.5 deg, of at most 11.5 deg, .* between waypoints 2 and 3"):
+    with pytest.raises(InfeasibleError, match=r"lean by 11.5 deg, of at most 11.5 deg, between waypoints 2 and 3"):
         plan(waypoints, 30.19, Limits(thruster_share=1.0), bluerov2, stretch=False)
 
 
