@@ -143,6 +143,8 @@ class Cable:
             tty.setraw(slave)
             link.symlink_to(os.ttyname(slave))
         self.addresses = tuple(f"slcan:{link}" for link in self.links)
+        self.shut = set()
+        """Ends whose adapter was reset: its channel is closed until it is opened again."""
         self.stop_read, self.stop_write = os.pipe()
         self.files = [*self.masters, *(slave for _, slave in ends), self.stop_read, self.stop_write]
         os.write(self.stop_write, b"x")
@@ -157,7 +159,8 @@ class Cable:
             for master in ready:
                 *lines, partial[master] = (partial[master] + os.read(master, 4096)).split(b"\r")
                 other = self.masters[master == self.masters[0]]
-                rest = b"".join(line + b"\r" for line in lines if line[:1] == b"t")
+                self.shut -= {master} if b"O" in lines else set()
+                rest = b"".join(line + b"\r" for line in lines if line[:1] == b"t" and not self.shut)
                 while rest:
                     stopped, _, _ = select.select([self.stop_read], [other], [])
                     if stopped:  # also if nobody reads the other end any more

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import termios
 import threading
+import time
 from typing import Any
 
 import can
@@ -194,6 +195,19 @@ class TestSlcan(PortSuite):
         one.close()
         other.close()
         again.unplug()
+
+    def test_adapter_that_is_reset_while_its_device_stays_is_opened_again(self, address_pair, cable):
+        """Regression: it forgets that its channel is open, reports no error, and was silent for ever."""
+        with open_port(address_pair[0], reader=True, now_ns=time.monotonic_ns) as one, open_port(address_pair[1]) as other:
+            other.send(FRAMES[1])
+            assert receive(one, 1) == [FRAMES[1]]
+            cable.shut.add(cable.masters[0])
+            one.send(FRAMES[1])
+            assert poll(lambda: not cable.shut)
+            for sender, receiver in ((one, other), (other, one)):
+                sender.send(FRAMES[2])
+                assert receive(receiver, 1) == [FRAMES[2]]
+            assert not faults(one)
 
     def test_adapter_that_takes_no_more_is_counted_and_tears_no_frame(self, pair, cable):
         one, other = pair

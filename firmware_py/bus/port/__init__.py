@@ -35,6 +35,8 @@ READ_TIMEOUT_S = 0.05
 """Longest sleep of the reader thread without a frame; also the longest time that closing takes."""
 REOPEN_EVERY = 16
 """Reads skipped between two attempts to open an interface that is present but does not open."""
+SILENCE_NS = 1_000_000_000
+"""Silence on the port's clock after which the channel of an adapter is opened anew; half of the silence that disarms the modules."""
 BUS_OFF = 0x40
 """CAN_ERR_BUSOFF of linux/can/error.h, in the id of an error frame."""
 LARGEST_ID = 0x7FF
@@ -65,6 +67,7 @@ class Port:
         self._closed = False
         self._is_lost = False
         self._skip_reopen = 0
+        self._silent_since_ns: int | None = None
         self._now_ns = now_ns
         self._arrival = arrival
         self._waiting: deque[Frame] = deque()
@@ -172,7 +175,9 @@ class Port:
                     self.faults["foreign"] += 1
         except Exception as error:  # as in send; also errors of a back end on garbage
             self._failed("receive", error)
-        if not frames:
+        if frames:
+            self._silent_since_ns = None
+        else:
             self._look_after(bus)
         return frames
 
@@ -194,6 +199,13 @@ class Port:
             bus.queue.lost = 0
         elif self._bus is not None and not self._link.is_same():
             self._let_go()
+        elif self._bus is not None and self._now_ns is not None:
+            now_ns = self._now_ns()
+            if self._silent_since_ns is None:
+                self._silent_since_ns = now_ns
+            elif now_ns - self._silent_since_ns >= SILENCE_NS:
+                self._silent_since_ns = now_ns
+                self._link.revive(bus)
 
     def _failed(self, direction: str, error: Exception) -> None:
         number = error_number(error)

@@ -58,6 +58,9 @@ class Link(ABC):
         """Whether the open interface is still the one that has the name now."""
         return True
 
+    def revive(self, bus: Any) -> None:  # noqa: B027
+        """Makes a silent bus work again whose interface may have lost its settings without an error."""
+
     def close(self, bus: Any) -> None:
         """Closes a bus from `open`, even if its interface is gone."""
         bus.shutdown()
@@ -275,6 +278,15 @@ class SlcanLink(Link):
                 raise PortError(f"slcan:{self.address}: the adapter accepts nothing; unplug it and plug it in again") from None
             hint = "it takes a serial device, slcan:/dev/ttyACM0"
             raise PortError(f"slcan:{self.address}: {_reason(error)}; {hint}") from None
+
+    def revive(self, bus: Any) -> None:
+        """Opens the channel anew: an adapter that was reset closes it, and says nothing any more.
+
+        Not within a line that is still to be accepted; the next silence is waited for then.
+        """
+        if not self._rest:
+            with contextlib.suppress(can.CanError):
+                bus.set_bitrate(BIT_RATE)
 
     def _take(self) -> None:
         """Locks the device. Raises BlockingIOError if another process holds it, before anything is sent to it."""
