@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import re
 import signal
@@ -144,15 +145,22 @@ def dask_cluster(address: str) -> Pool:
         return use
 
 
+def _quiet_dask() -> Any:
+    """The package of dask clusters. Its log says with tracebacks, on stderr, what the campaign says in one line: the scheduler is gone."""
+    import distributed
+
+    for name in ("distributed", "distributed.client"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    return distributed
+
+
 def _dask_client(address: str) -> Any:
     found = re.fullmatch(r"t(?:cp|ls)://(.+):(\d+)", address)
     if not found:
         raise DescriptionError(f"--dask {address!r} is not an address; it needs tcp://HOST:PORT, as `dask scheduler` prints it")
     try:
         socket.create_connection((found[1], int(found[2])), timeout=10).close()
-        from distributed import Client
-
-        return Client(address, timeout=10, set_as_default=False)
+        return _quiet_dask().Client(address, timeout=10, set_as_default=False)
     except (OSError, OverflowError, UnicodeError) as error:  # UnicodeError: an invalid host name
         raise DescriptionError(f"no dask scheduler at {address}: {error}; start one with `dask scheduler`") from None
 

@@ -1,5 +1,6 @@
 """Workers that die, lose a trial or are kept: every seed is flown, and the campaign's bytes are the same."""
 
+import logging
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from concurrent.futures.process import BrokenProcessPool
@@ -9,6 +10,7 @@ from typing import Any
 import pytest
 
 import hil.campaign
+import hil.workers
 from firmware_py.description.schema import DescriptionError
 from hil.workers import Pool, dask_cluster, reused
 from tests.unit.campaigns import Inline, PlugError, content, fly, flying
@@ -164,3 +166,11 @@ def test_workers_that_are_kept_serve_every_campaign_until_one_dies(tmp_path: Pat
 def test_cluster_that_is_not_there_is_said_in_one_line(address: str, words: str) -> None:
     with pytest.raises(DescriptionError, match=words):
         dask_cluster(address)
+
+
+def test_scheduler_that_dies_prints_no_traceback_of_dask() -> None:
+    """Regression: one killed while thousands of trials were submitted left 20 lines beside the one that says so."""
+    pytest.importorskip("distributed")
+    hil.workers._quiet_dask()
+    for name in ("distributed.batched", "distributed.client", "distributed.comm.tcp"):
+        assert not logging.getLogger(name).isEnabledFor(logging.ERROR)
