@@ -1,4 +1,5 @@
-"""Repairs a log that was torn by kill -9 or power loss, or is damaged: keeps the whole ticks before that, and closes both files.
+"""Repairs a log that was torn by kill -9 or power loss, or is damaged: keeps the whole ticks before that, and closes its files.
+A log of the bench beside them, if torn too, is cut to the same ticks.
 
 The original files are kept beside it as `NAME.torn`, or, where that name is taken, as `NAME.torn2` and so on.
 """
@@ -16,7 +17,7 @@ from typing import NamedTuple
 from mcap.records import Attachment, Channel, Message, Schema
 from mcap.writer import CompressionType, Writer
 
-from firmware_py.description.signals import log_records
+from firmware_py.description.signals import is_closed, log_records
 from firmware_py.runtime.flight_log import FlightLog, LogError
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, candump_stamp
 
@@ -39,18 +40,21 @@ def recover(folder: Path) -> Recovery:
     ticks, last_ns = 0, 0
     for logged in log.ticks():
         ticks, last_ns = ticks + 1, logged.time_ns
-    if not log.torn:
-        return Recovery(ticks, "")
-    if not ticks:
+    if not ticks and log.torn:
         raise LogError(f"{folder}: no tick of the log is whole")
-    mended = {name: folder / f"{name}.mended" for name in (SIGNAL_LOG, CAN_LOG)}  # a can.log that goes on longer is cut to the same ticks
-    _cut_frames(folder / CAN_LOG, mended[CAN_LOG], candump_stamp(last_ns))
-    rewrite(folder / SIGNAL_LOG, mended[SIGNAL_LOG], lambda topic, message: message.log_time <= last_ns)
+    beside = [path.name for path in sorted(folder.glob("*.mcap")) if path.name != SIGNAL_LOG and not is_closed(path)]  # of the bench
+    torn = "; ".join([*([log.torn] if log.torn else ()), *(f"{name} was not closed" for name in beside)])
+    mended = {name: folder / f"{name}.mended" for name in (*((SIGNAL_LOG, CAN_LOG) if log.torn else ()), *beside)}
+    for name, path in mended.items():  # a file that goes on longer is cut to the same ticks
+        if name == CAN_LOG:
+            _cut_frames(folder / name, path, candump_stamp(last_ns))
+        else:
+            rewrite(folder / name, path, lambda topic, message: message.log_time <= last_ns)
     for name, path in mended.items():
         shutil.copystat(folder / name, path)  # `app.last_flight` takes the age of the flight from this time
         _set_aside(folder / name)
         os.replace(path, folder / name)
-    return Recovery(ticks, log.torn)
+    return Recovery(ticks, torn)
 
 
 def _set_aside(path: Path) -> None:

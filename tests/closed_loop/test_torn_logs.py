@@ -4,6 +4,7 @@ import errno
 import os
 import re
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -20,13 +21,14 @@ from firmware_py.app.observers import recording
 from firmware_py.app.replay import replay
 from firmware_py.core.types import Inputs, Outputs
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.signals import is_closed
+from firmware_py.description.signals import is_closed, read_signals
 from firmware_py.runtime import guarded_file
 from firmware_py.runtime.flight_log import FlightLog, LogError
 from firmware_py.runtime.guarded_file import GuardedFile, QueuedFile
 from firmware_py.runtime.log_recovery import _cut_frames, recover
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder, candump_stamp
 from hil.bench import open_bench
+from hil.truth_log import TRUTH_LOG
 from tests.closed_loop.flights import shortened
 
 TICKS, TICKS_A_SECOND = 500, 100
@@ -97,6 +99,22 @@ def test_torn_log_is_read_up_to_the_tear_and_mended(log: Path, seed: int) -> Non
     mended = replay(log)
     assert (mended.first, mended.ticks, mended.torn) == (None, len(ticks), "")
     assert recover(log) == (len(ticks), "")
+
+
+@pytest.mark.parametrize("share", [0.5, 1.0])
+def test_torn_log_of_the_bench_is_mended_with_that_of_the_vehicle(log: Path, share: float) -> None:
+    """Regression: it stayed torn, and readers of MCAP other than our own refuse a file without an end."""
+    shutil.copyfile(log / SIGNAL_LOG, log / TRUTH_LOG)
+    tear(log / TRUTH_LOG, 0.8)
+    tear(log / SIGNAL_LOG, share)
+    torn = (log / TRUTH_LOG).read_bytes()
+    last = max(ticks_of(log))
+    assert recover(log).torn.endswith("truth.mcap was not closed")
+    assert is_closed(log / TRUTH_LOG) and (log / f"{TRUTH_LOG}.torn").read_bytes() == torn
+    mended = read_signals(log / TRUTH_LOG)["/firmware/ticks"]["tick"]
+    assert list(mended) == list(range(1, len(mended) + 1)) and 0.7 * share * TICKS < len(mended) <= last
+    assert (log / f"{SIGNAL_LOG}.torn").exists() == (share < 1.0)
+    assert recover(log) == (last, "")
 
 
 def test_log_on_a_disk_without_links_is_mended_too(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
