@@ -36,6 +36,8 @@ _SETTLE_TICKS = 3
 _HOLD_TICKS = 100
 """Ticks from the request of a hold until it must be in force; ticks queued while the loop took the request count too."""
 _REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
+_LATE_FOR_HOLD_S = 1.0
+"""Delay beyond which a body that comes to its hold has the rest of the mission planned anew from there, the hold first."""
 _ANOTHER = "the body is another one"
 _PRESENT = -1
 """DO_SET_MISSION_CURRENT's number for the current item."""
@@ -145,7 +147,8 @@ class MissionFlight:
             return "nothing is left to fly"
         self._repeat = [repeat for repeat in self._repeat if repeat[0] < legs[0].sequence]
         s.progress.state, s.progress.current, self._started_at_item = ACTIVE, legs[0].sequence, wanted
-        self._begin(legs)
+        if not self._flies_already(legs):
+            self._begin(legs)
         return ""
 
     def jump(self, index: int) -> str:
@@ -204,7 +207,9 @@ class MissionFlight:
         if s.progress.state == ACTIVE:
             self._end(PAUSED)
         turned = yaw if math.isfinite(yaw) else None
-        self._begin((Leg(GO_TO, place, turned, 0.0, speed_m_s if speed_m_s > 0 else math.nan),))
+        legs = (Leg(GO_TO, place, turned, 0.0, speed_m_s if speed_m_s > 0 else math.nan),)
+        if not self._flies_already(legs):
+            self._begin(legs)
         return ""
 
     # ------------------------------------------------------------ events
@@ -243,7 +248,8 @@ class MissionFlight:
             if tracking and flight.started_ns is None:
                 flight.started_ns = time_ns
             if tracking:
-                flight.task_changes = self._system.task_changes  # no request so far has given the body another task
+                if flight.task_changes != self._system.task_changes:  # no request so far has given the body another task
+                    flight.task_changes, flight.changed_tick = self._system.task_changes, s.picture.ticks
                 self._advance(flight, time_ns)
             elif flight.started_ns is not None:
                 self._end(PAUSED)
@@ -315,6 +321,11 @@ class MissionFlight:
             if not away_m <= leg.acceptance_m:
                 self._tell_if_late(flight, t_s, away_m)
                 return
+            rest = flight.legs[flight.reached :]
+            if leg.hold_s > 0 and len(rest) > 1 and t_s - flight.arrivals_s[flight.reached] > _LATE_FOR_HOLD_S:
+                if self._is_on_its_way(flight):
+                    self._begin(rest, flight.replaced)  # a part of the hold, which runs on the plan's clock, is over
+                return
             flight.reach(t_s)
             self._tell_reached(flight, leg.sequence, time_ns)
         last = flight.legs[-1]
@@ -348,8 +359,6 @@ class MissionFlight:
             self._system.broadcast("MISSION_ITEM_REACHED", {"seq": self._repeat.pop(0)[0]})
 
     def _begin(self, legs: Sequence[Leg], replaced: bool = False) -> None:
-        if self._flies_already(legs):
-            return
         s = self._system.subject
         self._system.ask(Action.SET_MODE, Mode.POSHOLD)
         changes, members = self._system.task_changes, s.picture.members(s.body)
@@ -370,10 +379,12 @@ class MissionFlight:
         return 0.0 if flight.started_ns is None else (self._system.subject.picture.time_ns - flight.started_ns) / NS_PER_S
 
     def _is_on_its_way(self, flight: Flight) -> bool:
-        """Whether the body still has the flight for its task, also where the next tick would only find out."""
+        """Whether the body has the flight for its task, and nothing that was asked for in the last ticks may yet give it another."""
         s = self._system.subject
-        tracks = flight.started_ns is None or (s.armed and s.picture.mode(s.body) == Mode.AUTO)
-        return tracks and self._system.task_changes == flight.task_changes
+        if self._system.task_changes != flight.task_changes:
+            return False
+        tracks = s.armed and s.picture.mode(s.body) == Mode.AUTO and s.picture.ticks >= flight.changed_tick + _SETTLE_TICKS
+        return flight.started_ns is None or tracks
 
     @property
     def _first(self) -> int:

@@ -46,6 +46,8 @@ class Flight:
     arrivals_s: tuple[float, ...] = ()
     task_changes: int = 0
     """System.task_changes when the flight was requested; while it is tracked, as of the last tick."""
+    changed_tick: int = 0
+    """Tick in which task_changes was seen to change while the flight is tracked."""
     members: tuple[int, ...] = ()
     """Fleet indices of the body's modules when the flight was requested: it is planned for these."""
     hold_reached: bool = False

@@ -114,6 +114,27 @@ def test_last_hold_begins_when_the_body_is_there(world: World, client: Client) -
     assert "mission complete" in client.texts
 
 
+@pytest.mark.parametrize("is_paused", [False, True])
+def test_hold_of_a_body_that_comes_late_begins_when_it_is_there(world: World, client: Client, is_paused: bool) -> None:
+    """Regression: it ran from the planned time, so that a body that came 4 s late to a hold of 5 s stayed for one."""
+    world.robot.off_plan = HELD_BACK
+    start(world, client, item(0, PLACES[0], p=(5, 0, 0, NAN)), item(1, PLACES[1]))
+    world.run(1400)
+    world.robot.off_plan = np.zeros(3)
+    if is_paused:
+        client.command(193, 0)
+    world.run(10)
+    if is_paused:
+        assert not world.station.jobs() and client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_PAUSED
+        return
+    (job,) = world.station.jobs()
+    assert [(leg.sequence, leg.hold_s) for leg in job.legs] == [(0, 5.0), (1, 0.0)]
+    assert not client.all("MISSION_ITEM_REACHED")
+    world.station.planned(0, plan_of(job, first_arrival_s=0.02))
+    world.run(50)
+    assert [m.seq for m in client.all("MISSION_ITEM_REACHED")][:1] == [0] and not world.station.jobs()
+
+
 def test_delay_without_a_place_is_over_in_time_wherever_the_body_is(world: World, client: Client) -> None:
     world.robot.off_plan = HELD_BACK
     start(world, client, item(0, (0, 0, 0), command=93, frame=2, p=(10, -1, -1, -1)), item(1, PLACES[0]))

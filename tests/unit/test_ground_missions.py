@@ -317,10 +317,12 @@ def test_speed_that_is_set_replaces_that_of_an_item_passed_up_to_the_next_such_i
     assert [leg.speed_m_s for leg in job.legs] == pytest.approx([0.3, 0.3, 0.5])
 
 
-def test_speed_that_is_set_does_not_take_a_body_back_from_a_hold(world: World, client: Client) -> None:
+@pytest.mark.parametrize("ticks", [0, 1, 2, 3, 5])
+def test_speed_that_is_set_does_not_take_a_body_back_from_a_hold(world: World, client: Client, ticks: int) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     fly(world, client)
     client.command(193, 0)
+    world.run(ticks)
     client.command(178, 1, 0.3)
     world.run(10)
     assert world.station.jobs() == [] and world.robot.mode[0] == Mode.POSHOLD
