@@ -167,12 +167,15 @@ def _waypoints(task: Task, start: Setpoint, fleet: Fleet) -> Trajectory:
 
 
 def _infeasible(error: ValueError, task: Task) -> DescriptionError:
-    """The error for a file whose path cannot be flown: with the line of the waypoint that cannot be held, or that ends a piece."""
+    """The error for a file whose path cannot be flown: with the line of the waypoint that cannot be held, or behind the hurried piece."""
     if not isinstance(error, InfeasibleError):
         return DescriptionError(f"{task.file}: {error}")
-    stands = error.place.time_s is None
-    line = line_of(task.file_text, task.file, error.place.waypoint + (not stands))
-    return DescriptionError(f"{task.file}:{line}: {error}{'' if stands else '; allow more time'}")
+    if error.place.time_s is None:
+        return DescriptionError(f"{task.file}:{line_of(task.file_text, task.file, error.place.waypoint)}: {error}")
+    slow, where = error.place.waypoint, ""
+    if error.hurried is not None:
+        slow, where = error.hurried, f" between waypoints {error.hurried} and {error.hurried + 1}"
+    return DescriptionError(f"{task.file}:{line_of(task.file_text, task.file, slow + 1)}: {error}; allow more time{where}")
 
 
 def _refuse_unbounded(mission: Mission, file: str) -> None:

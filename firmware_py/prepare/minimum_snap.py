@@ -122,8 +122,10 @@ def _plan(
     if durations_s is not None and not stretch:
         try:
             return request.attempt(base)
-        except InfeasibleError:
+        except InfeasibleError as error:
             request.check_standing()  # where that is the reason, more time would not help
+            if isinstance(durations_s, Sequence | np.ndarray):
+                error.hurried = int(np.argmin(base / request.durations(float(base.sum()))))
             raise
     request.check_standing()
     if durations_s is None:

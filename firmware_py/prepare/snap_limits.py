@@ -67,11 +67,14 @@ class InfeasibleError(ValueError):
 
     Attributes:
         place: where the request is not met.
+        hurried: index of the waypoint before the piece with the least time for its way; None unless a duration is given for each. A piece
+            that is too short makes its neighbours swing out, which have the time to, so that the limit is mostly exceeded in one of these.
     """
 
     def __init__(self, what: str, place: Place, rest: str = "") -> None:
         super().__init__(what, place, rest)
         self.place = place
+        self.hurried: int | None = None
 
     def __str__(self) -> str:
         return self.worded(str(self.place))

@@ -90,6 +90,19 @@ def test_path_is_stretched_until_the_thrusters_can_fly_it(one: Body) -> None:
     assert usage(one, wrenches(one, motion))[0] == pytest.approx(0.8, abs=0.01)
 
 
+@pytest.mark.parametrize("short", range(4))
+def test_refusal_names_the_piece_that_is_too_short_and_not_its_neighbour_that_swings_out(one: Body, short: int) -> None:
+    """Regression: in 42 of 53 random paths it named another piece than the one with too little time."""
+    waypoints = [Waypoint(np.array([1.0 * k, 0.3 * (-1.0) ** k, 0.2 * k])) for k in range(5)]
+    durations = [1.0 if k == short else 8.0 for k in range(4)]
+    with pytest.raises(InfeasibleError, match="thrusters would be used to") as refused:
+        plan(waypoints, durations, body=one, stretch=False)
+    assert refused.value.hurried == short
+    with pytest.raises(InfeasibleError) as refused:
+        plan(waypoints, 4.0, body=one, stretch=False)
+    assert refused.value.hurried is None
+
+
 @pytest.mark.slow
 def test_free_durations_are_as_short_as_the_thrusters_allow(one: Body) -> None:
     found = plan(poses(4), None, body=one)
