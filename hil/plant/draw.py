@@ -22,7 +22,12 @@ SOURCES = (
 
 
 def stream(seed: int, source: str, module: int = 0) -> np.random.Generator:
-    """Returns the generator for one source of error of one module, as nested SeedSequence(seed).spawn calls would create it."""
+    """Returns the generator for one source of error of one module, as nested SeedSequence(seed).spawn calls would create it.
+
+    Raises ValueError for a source without a stream.
+    """
+    if source not in SOURCES:
+        raise ValueError(f"no stream is called {source!r}; append the name to SOURCES")
     sequence = np.random.SeedSequence(seed, spawn_key=(SOURCES.index(source), module))
     return np.random.Generator(np.random.PCG64(sequence))
 

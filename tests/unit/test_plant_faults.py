@@ -10,6 +10,7 @@ from firmware_py.bus.codec import Frame, Receiver
 from firmware_py.description.schema import DescriptionError
 from hil.faults import Faults, Wire
 from hil.nodes import Nodes, make_nodes
+from hil.plant.draw import stream
 from hil.plant.fault_spec import FRAME_KINDS, TAKES, THRUSTER_KINDS, Fault
 from hil.scenario import load_scenario, make_world
 from tests.unit.mcu_frames import ARMED, CODEC, sync, thrust
@@ -354,6 +355,12 @@ def test_frame_fault_of_one_module_is_of_the_frames_with_its_number(kind: str) -
     out = Wire(0, "to_plant").pass_on(frames, [Fault(kind=kind, value=1.0, module=3)], 0)
     assert [f for f in out if f.id & 31 != 3] == [f for f in frames if f.id & 31 != 3]
     assert out.count(FRAMES[3]) == (2 if kind == "frame_duplicate" else 0)
+
+
+def test_source_without_a_stream_is_refused_by_its_name() -> None:
+    """Regression: the words were "tuple.index(x): x not in tuple"."""
+    with pytest.raises(ValueError, match="no stream is called 'sonar'; append the name to SOURCES"):
+        stream(0, "sonar")
 
 
 def test_every_direction_draws_from_a_stream_of_its_own() -> None:
