@@ -1,4 +1,4 @@
-"""For each fail-safe: the figure that it judges, a health just beyond its limit, and parameters with which it alone acts, without delay."""
+"""For each fail-safe: its figure and words, a health just beyond its limit, and parameters with which it alone acts, without delay."""
 
 import math
 from dataclasses import replace
@@ -28,6 +28,37 @@ YES: dict[str, Any] = {
     "leak": True, "foreign_sync": True, "foreign_command": True, "axis_lost": 1,
     "partner_lost": (DockRequest(0, 0, 1, 1),), "thruster_lost": (3,),
 }  # fmt: skip
+WORDS = {
+    "leak": "water in a cabin",
+    "bus_silent": "bus silent for 2.0 s",
+    "foreign_sync": "somebody else sends SYNC",
+    "foreign_command": "somebody else commands modules",
+    "battery_critical": "battery critical: 80% of its voltage",
+    "cabin_hot": "cabin hot: 70 degC",
+    "cabin_pressure": "cabin pressure off by 20000 Pa",
+    "axis_lost": "the thrusters left cannot make every wrench",
+    "depth_unknown": "depth unknown for 5.0 s",
+    "tag_gone": "no tag for 8.0 s",
+    "partner_lost": "a docked partner is lost",
+    "estimator": "sensors and model disagree: 5.0 of the expected",
+    "rejected": "tags refused: 80% of them",
+    "tag_lost": "no tag for 8.0 s",
+    "pushed": "pushed out of sight as by a current of 0.5 m/s",
+    "tag_late": "no tag for 1.0 s",
+    "depth_lost": "no pressure for 1.0 s",
+    "imu_lost": "no IMU for 0.5 s",
+    "module_silent": "a module is silent for 0.5 s",
+    "ticks_missed": "ticks missed: 5 in a second",
+    "fence": "outside the fence by 0.05 m",
+    "collision": "another body is in the way, 0.2 s to brake",
+    "ground_lost": "ground station silent for 5.0 s",
+    "pilot_lost": "pilot silent for 1.0 s",
+    "thruster_lost": "a thruster is out",
+    "cabin_unknown": "no reading of a cabin for 2.0 s",
+    "battery_unknown": "no reading of a battery for 2.0 s",
+    "battery_low": "battery low: 87% of its voltage",
+}
+"""Words of each with its cause only just present (see `bad`)."""
 
 
 def spoilt(name: str, value: float) -> Health:
