@@ -1,8 +1,8 @@
 """Time that each body has left before it must brake to stop before another: a figure of the health (`collision_s`).
 
-All bodies move on as they do now; and each, besides, as its guidance wants to: one that waits before another would reach it as soon as it
-goes on. A hull counts as the upright cylinder about its box as it is turned now. Braking takes the longer way of the set-point, which
-changes speed through a filter, and of thrusters that are too weak to follow it.
+All bodies move and turn on as they do now; and each, besides, as its guidance wants to: one that waits before another would reach it as
+soon as it goes on. A hull counts as the upright cylinder about its box as it is turned now. Braking takes the longer way of the
+set-point, which changes speed through a filter, and of thrusters that are too weak to follow it.
 """
 
 from __future__ import annotations
@@ -14,13 +14,16 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.body import Body
-from firmware_py.core.rotations import M, V, cross, rotate
+from firmware_py.core.rotations import M, V, exp, multiply, rotate, turned
 from firmware_py.core.setpoint import way_to_rest_s
 from firmware_py.core.types import Estimate
 
 CLOSING_M_S, OWN_M_S = 0.08, 0.04
 """Speed at which two modules must near each other to count, and the least part of it that must be a body's own, so that it can help. A hull
 bears a slower bump (docks touch at up to 0.06), and a body may pass close by another slowly."""
+PIECES = 16
+"""Straight pieces in which modules that a turn carries along are followed, for a whole turn of the body that turns fastest. The arc leaves
+its piece by 2 % of its radius."""
 
 
 def braking_s(speed: np.ndarray, deceleration: np.ndarray, bandwidth: float) -> np.ndarray:
@@ -40,7 +43,7 @@ def braking_s(speed: np.ndarray, deceleration: np.ndarray, bandwidth: float) -> 
 def times_to_brake(
     bodies: Sequence[Body],
     estimates: Mapping[int, Estimate],
-    wanted_w: Mapping[int, np.ndarray],
+    wanted: Mapping[int, np.ndarray],
     deceleration: Mapping[int, np.ndarray],
     bandwidth: float,
     pairs: Collection[tuple[int, int]] = (),
@@ -50,7 +53,7 @@ def times_to_brake(
 
     Args:
         estimates: by number of the body. A body whose place is unknown is left out.
-        wanted_w: by number, the (3,) velocity in the world that guidance wants, m/s.
+        wanted: by number, (6,) velocity in the world, m/s, and turning rate in the body's frame, rad/s, that guidance wants.
         deceleration: by number, (2,) that of the thrusters that are used, as Body.deceleration.
         bandwidth: with which the set-points come to rest, rad/s.
         pairs: numbers of two bodies each that are no obstacles to each other, because they dock or have just parted.
@@ -65,36 +68,42 @@ def times_to_brake(
         if set(pair) <= set(numbers):
             a, b = map(numbers.index, pair)
             ignored[a, b] = ignored[b, a] = True
-    modules = [in_world(*estimates[body.index][:3], body.r_bm, body.hull_m) for body in placed]
     of_body = np.repeat(np.arange(len(placed)), [len(body.modules) for body in placed])
-    r_w, v_w, cylinder = map(np.concatenate, zip(*modules, strict=True))
-    wanted = np.array([wanted_w[number] for number in numbers])
-    nu = np.array([estimates[number].nu for number in numbers]).reshape(len(placed), 2, 3)
+    r_bm, hull_m = np.concatenate([body.r_bm for body in placed]), np.concatenate([body.hull_m for body in placed])
+    p_wb, q_wb, now = (np.array(parts) for parts in zip(*(estimates[number][:3] for number in numbers), strict=True))
+    for motion, attitude in zip(now, q_wb, strict=True):
+        motion[:3] = rotate(attitude, motion[:3].copy())
     slowing = np.array([deceleration[number] for number in numbers])
-    own, asked = np.linalg.norm(nu, axis=2), np.zeros((len(placed), 2))
-    asked[:, 0] = np.linalg.norm(wanted, axis=1)
-    left = np.fmin(
-        _soonest(r_w, v_w, v_w, cylinder, of_body, ignored) - braking_s(own, slowing, bandwidth),
-        _soonest(r_w, wanted[of_body], v_w, cylinder, of_body, ignored) - braking_s(asked, slowing, bandwidth),
-    )
-    return times | dict(zip(numbers, np.maximum(left, 0.0).tolist(), strict=True))
+    left = []
+    for own in (now, np.array([wanted[number] for number in numbers])):
+        speeds = np.linalg.norm(own.reshape(-1, 2, 3), axis=2)
+        left.append(_soonest(p_wb, q_wb, own, now, of_body, r_bm, hull_m, ignored) - braking_s(speeds, slowing, bandwidth))
+    return times | dict(zip(numbers, np.maximum(np.fmin(*left), 0.0).tolist(), strict=True))
 
 
-@njit(f"Tuple(({M},{M},{M}))({V},{V},{V},{M},{M})", cache=True)
-def in_world(p_wb, q_wb, nu, r_bm, hull_m):  # type: ignore[no-untyped-def]
-    """(m, 3) places of a body's modules, m, (m, 3) their velocities, m/s, world, and (m, 2) radius and half the height of the upright
-    cylinders about their hulls, m.
-    """
-    r_w, v_w, cylinder = np.empty_like(r_bm), np.empty_like(r_bm), np.zeros((r_bm.shape[0], 2))
-    for m in range(r_bm.shape[0]):
-        r_w[m] = p_wb + rotate(q_wb, r_bm[m])
-        v_w[m] = rotate(q_wb, nu[:3] + cross(nu[3:], r_bm[m]))
+@njit(f"{M}(float64,{M},{M},{M},int64[::1],{M})", cache=True)
+def places(t_s, p_wb, q_wb, motion, of_body, r_bm):  # type: ignore[no-untyped-def]
+    """(m, 3) places of all modules in the world, m, after `t_s` at `motion`: (b, 6) velocity, world, and turning rate, body, of each."""
+    r_w = np.empty_like(r_bm)
+    for m in range(of_body.size):
+        b = of_body[m]
+        if m == 0 or b != of_body[m - 1]:
+            p_then, q_then = p_wb[b] + t_s * motion[b, :3], multiply(q_wb[b], exp(t_s * motion[b, 3:]))
+        north, east, down = turned(q_then, r_bm[m, 0], r_bm[m, 1], r_bm[m, 2])
+        r_w[m, 0], r_w[m, 1], r_w[m, 2] = p_then[0] + north, p_then[1] + east, p_then[2] + down
+    return r_w
+
+
+@njit(f"{M}({M},int64[::1],{M})", cache=True)
+def cylinders(q_wb, of_body, hull_m):  # type: ignore[no-untyped-def]
+    """(m, 2) radius and half the height of the upright cylinders about the hulls of all modules, m."""
+    out = np.zeros((of_body.size, 2))
+    for m in range(of_body.size):
         x, y, z = 0.5 * hull_m[m]
         for corner_b in ((x, y, z), (x, -y, z), (-x, y, z), (-x, -y, z)):  # the other four are opposite
-            corner = rotate(q_wb, np.array(corner_b))
-            cylinder[m, 0] = max(cylinder[m, 0], math.hypot(corner[0], corner[1]))
-            cylinder[m, 1] = max(cylinder[m, 1], abs(corner[2]))
-    return r_w, v_w, cylinder
+            north, east, down = turned(q_wb[of_body[m]], *corner_b)
+            out[m, 0], out[m, 1] = max(out[m, 0], math.hypot(north, east)), max(out[m, 1], abs(down))
+    return out
 
 
 @njit("UniTuple(float64,2)(float64,float64,float64)", cache=True)
@@ -108,17 +117,16 @@ def within(excess, rate, speed2):  # type: ignore[no-untyped-def]
     return (-rate - math.sqrt(under_root)) / speed2, (-rate + math.sqrt(under_root)) / speed2
 
 
-@njit(f"{V}({M},{M},{M},{M},int64[::1],boolean[:,::1])", cache=True)
-def _soonest(r_w, own_w, v_w, cylinder, of_body, ignored):  # type: ignore[no-untyped-def]
-    """(b,) the least time to collision over all pairs of modules of two bodies, s; NaN where there is none. Each body moves at `own_w`,
-    (m, 3), while the others move at `v_w`, (m, 3).
+@njit(f"void({M},{M},{M},{M},{M},int64[::1],boolean[:,::1],float64,float64,{V})", cache=True)
+def _meet(own_r, own_w, r_w, v_w, cylinder, of_body, ignored, begins_s, lasts_s, out):  # type: ignore[no-untyped-def]
+    """Lowers `out`, (b,), to the least time to collision over all pairs of modules of two bodies, s, in a straight piece of their ways from
+    `begins_s` for `lasts_s`. Each body moves from `own_r` at `own_w`, (m, 3), while the others move from `r_w` at `v_w`, (m, 3).
     """
-    out = np.full(len(ignored), np.nan)
     for i in range(of_body.size):
         for j in range(of_body.size):
             if ignored[of_body[i], of_body[j]]:
                 continue
-            north, east, down = r_w[j, 0] - r_w[i, 0], r_w[j, 1] - r_w[i, 1], r_w[j, 2] - r_w[i, 2]
+            north, east, down = r_w[j, 0] - own_r[i, 0], r_w[j, 1] - own_r[i, 1], r_w[j, 2] - own_r[i, 2]
             v_n, v_e, v_d = v_w[j, 0] - own_w[i, 0], v_w[j, 1] - own_w[i, 1], v_w[j, 2] - own_w[i, 2]
             own = north * own_w[i, 0] + east * own_w[i, 1] + down * own_w[i, 2]
             level_rate, down_rate, level2, down2 = north * v_n + east * v_e, down * v_d, north**2 + east**2, down**2
@@ -127,7 +135,29 @@ def _soonest(r_w, own_w, v_w, cylinder, of_body, ignored):  # type: ignore[no-un
                 radius_m, height_m = cylinder[i, 0] + cylinder[j, 0], cylinder[i, 1] + cylinder[j, 1]
                 beside = within(level2 - radius_m**2, level_rate, v_n**2 + v_e**2)
                 above = within(down2 - height_m**2, down_rate, v_d**2)
-                begins = max(beside[0], above[0], 0.0)
-                if begins <= min(beside[1], above[1]):
-                    out[of_body[i]] = np.fmin(out[of_body[i]], begins)
+                meets_s = max(beside[0], above[0], 0.0)
+                if meets_s <= min(beside[1], above[1], lasts_s):
+                    out[of_body[i]] = np.fmin(out[of_body[i]], begins_s + meets_s)
+
+
+@njit(f"{V}({M},{M},{M},{M},int64[::1],{M},{M},boolean[:,::1])", cache=True)
+def _soonest(p_wb, q_wb, own, now, of_body, r_bm, hull_m, ignored):  # type: ignore[no-untyped-def]
+    """(b,) the least time to collision, s; NaN where there is none. Each body moves at its motion in `own`, (b, 6) as in `places`, while
+    the others move at theirs in `now`. All go straight on after a whole turn, or at once if no turn carries a module along fast enough.
+    """
+    fastest = 0.0
+    for motion in (own, now):
+        for m in range(of_body.size):
+            rate = math.sqrt((motion[of_body[m], 3:] ** 2).sum())
+            if rate * math.sqrt((r_bm[m] ** 2).sum()) > OWN_M_S:
+                fastest = max(fastest, rate)
+    pieces, piece_s = (PIECES, 2.0 * math.pi / PIECES / fastest) if fastest > 0.0 else (0, 0.0)
+    out, cylinder = np.full(len(ignored), np.nan), cylinders(q_wb, of_body, hull_m)
+    own_r, r_w = places(0.0, p_wb, q_wb, own, of_body, r_bm), places(0.0, p_wb, q_wb, now, of_body, r_bm)
+    for k in range(pieces):
+        own_then = places((k + 1) * piece_s, p_wb, q_wb, own, of_body, r_bm)
+        then = places((k + 1) * piece_s, p_wb, q_wb, now, of_body, r_bm)
+        _meet(own_r, (own_then - own_r) / piece_s, r_w, (then - r_w) / piece_s, cylinder, of_body, ignored, k * piece_s, piece_s, out)
+        own_r, r_w = own_then, then
+    _meet(own_r, own[:, :3][of_body], r_w, now[:, :3][of_body], cylinder, of_body, ignored, pieces * piece_s, math.inf, out)
     return out

@@ -80,10 +80,10 @@ class Formation:
     def watch_distances(self, time_ns: int, estimates: dict[int, Estimate]) -> None:
         """Tells each body's health when it must brake before another. Two that dock or have just parted are no obstacles to each other."""
         self._parted = [parted for parted in self._parted if time_ns - parted[0] <= PARTED_NS]
-        wanted_w = {pipeline.body.index: pipeline.guidance.wanted_w for pipeline in self.pipelines}
+        wanted = {pipeline.body.index: pipeline.guidance.wanted for pipeline in self.pipelines}
         deceleration = {pipeline.body.index: pipeline.faults.now.deceleration for pipeline in self.pipelines}
         pairs = [*self.docking.pairs, *(pieces for _, pieces in self._parted)]
-        times_s = times_to_brake(self.bodies, estimates, wanted_w, deceleration, self.parameters.steering.bandwidth, pairs)
+        times_s = times_to_brake(self.bodies, estimates, wanted, deceleration, self.parameters.steering.bandwidth, pairs)
         for pipeline in self.pipelines:
             pipeline.health.collision_s = times_s[pipeline.body.index]
             pipeline.guidance.deceleration = deceleration[pipeline.body.index]

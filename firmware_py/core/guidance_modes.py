@@ -23,7 +23,7 @@ from firmware_py.core.transitions import Effect
 from firmware_py.core.types import COMMAND_TIMEOUT_NS, Estimate, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 
-ZERO, DOWN = np.zeros(3), np.array([0.0, 0.0, 1.0])
+ZERO, STILL, DOWN = np.zeros(3), np.zeros(6), np.array([0.0, 0.0, 1.0])
 STILL_S = COMMAND_TIMEOUT_NS / 1e9
 """Longest gap between two ticks. After a longer one the microcontrollers have stopped all thrust (can_dbc/README.md), and the set-point
 restarts from the body."""
@@ -100,8 +100,9 @@ class Guidance:
         """Whether the mode has changed since, so that a new blend begins at `_wrench`."""
         self._offset, self._offset_ns = np.zeros(6), 0
         """Wrench of the mode before less that of the new one, (6,), when the mode changed, and that time: it fades out from then on."""
-        self.wanted_w = ZERO
-        """(3,) velocity at which this body would move if no other were in its way, world, m/s; zero in modes that stop before none."""
+        self.wanted = STILL
+        """(6,) velocity, world, m/s, and turning rate, body, rad/s, at which this body would move if no other were in its way; zero in
+        modes that stop before none."""
         self.mode = Mode.POSHOLD
 
     def retune(self, parameters: Parameters) -> None:
@@ -236,7 +237,7 @@ class Guidance:
 
     def step(self, time_ns: int, estimate: Estimate, health: Health) -> tuple[Setpoint, Setpoint]:
         """Returns the set-point at `time_ns`, and the one `lead_s` later, for the feed-forward."""
-        self.wanted_w = ZERO
+        self.wanted = STILL
         dt_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) * 1e-9
         self._time_ns = time_ns
         if dt_s > STILL_S:
@@ -246,7 +247,7 @@ class Guidance:
         if self.mode == Mode.AUTO and self._trajectory is not None and self._joined(self._trajectory, time_ns):
             sampled = self._sample(self._trajectory, time_ns)
             if sampled is not None:
-                self.wanted_w = sampled[0].v_w
+                self.wanted = np.r_[sampled[0].v_w, sampled[0].w_b]
                 return sampled
             self._trajectory = None  # it has a gap: the body stops before it
         if self.mode == Mode.DOCK and isinstance(self._docking, Setpoint):
@@ -312,15 +313,17 @@ class Guidance:
         return Wish(self._velocity_in_fence(at.p_wb, v_w), rate)
 
     def _stopped_before_others(self, wish: Wish, health: Health) -> Wish:
-        """Returns the wish, or rest where it leads to another body in too short a time; keeps the velocity that was wanted."""
+        """Returns the wish, or rest where it leads to another body in too short a time; keeps the motion that was wanted."""
         if self.mode not in FREE or self._least_s == 0.0:
             return wish
-        self.wanted_w = wish.v_w
-        if wish.p_wb is not None:
-            way = np.nan_to_num(wish.p_wb - self._glider.at.p_wb)
-            # least time to a place, so that the fail-safe `collision` permits one just before another body
-            arrival_s = self._least_s + float(braking_s(np.array([self._p.speed_m_s, 0.0]), self.deceleration, self._p.bandwidth))
-            self.wanted_w = wish.v_w + way / max(arrival_s, float(np.linalg.norm(way)) / self._p.speed_m_s)
+        at, most = self._glider.at, np.array([self._p.speed_m_s, self._p.rate_rad_s if wish.rate_rad_s is None else wish.rate_rad_s])
+        way = ZERO if wish.p_wb is None else np.nan_to_num(wish.p_wb - at.p_wb)
+        turn = ZERO if wish.q_wb is None else np.asarray(difference(wish.q_wb, at.q_wb))
+        length = np.array([np.linalg.norm(way), np.linalg.norm(turn)])
+        # least time to a pose, so that the fail-safe `collision` permits one just before another body
+        arrival_s = self._least_s + braking_s(np.minimum(most, length / self._least_s), self.deceleration, self._p.bandwidth)
+        move_s, turn_s = np.maximum(arrival_s, length / most)
+        self.wanted = np.r_[wish.v_w + way / move_s, wish.w_b + turn / turn_s]
         return REST if health.collision_s < self._least_s else wish
 
     def _guided(self, time_ns: int) -> Wish:

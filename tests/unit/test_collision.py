@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core.body import Body, deceleration_of
-from firmware_py.core.collision import CLOSING_M_S, OWN_M_S, braking_s, in_world, times_to_brake, within
+from firmware_py.core.collision import CLOSING_M_S, OWN_M_S, PIECES, braking_s, cylinders, times_to_brake, within
 from firmware_py.core.rotations import from_euler, rotate_back
 from firmware_py.core.setpoint import REST, Glider
 from firmware_py.core.types import NEVER_AGE_NS, Action, EscFeedback, Estimate, Mode, Request, Setpoint, Sticks
@@ -23,7 +23,7 @@ from tests.unit.tanks import MODCUBE, FaultyTank, world
 EDGE_M = float(MODCUBE.hull.size_m[0])
 TOUCH_M = EDGE_M * 2.0**0.5
 """Distance of the centres of two level cubes at which their corners can touch first."""
-ZERO, LEVEL = np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0])
+ZERO, STILL, LEVEL = np.zeros(3), np.zeros(6), np.array([1.0, 0.0, 0.0, 0.0])
 
 
 def at_once(body: Body) -> Body:
@@ -44,12 +44,17 @@ def at(place: Sequence[float], velocity: Sequence[float] = (0.0, 0.0, 0.0), turn
 def times_of(
     bodies: Sequence[Body],
     estimates: dict[int, Estimate],
-    wanted_w: dict[int, np.ndarray],
+    wanted: dict[int, np.ndarray],
     bandwidth: float,
     pairs: Sequence[tuple[int, int]] = (),
 ) -> dict[int, float]:
     """Times to brake of bodies whose thrusters all turn."""
-    return times_to_brake(bodies, estimates, wanted_w, {body.index: body.deceleration for body in bodies}, bandwidth, pairs)
+    return times_to_brake(bodies, estimates, wanted, {body.index: body.deceleration for body in bodies}, bandwidth, pairs)
+
+
+def reaches(body: Body, q_wb: np.ndarray) -> np.ndarray:
+    """(m, 2) radius and half the height of the upright cylinders about the hulls of a body's modules, m."""
+    return np.asarray(cylinders(q_wb[None], np.zeros(len(body.modules), dtype=np.int64), body.hull_m))
 
 
 def pair(
@@ -57,7 +62,7 @@ def pair(
 ) -> tuple[float, float]:
     """Times of bodies 0 and 5; `wanted`: velocity that the guidance of body 0 wants."""
     bodies = [single(0), single(5)]
-    times_s = times_of(bodies, {0: first, 5: second}, {0: np.array(wanted), 5: ZERO}, math.inf, pairs)
+    times_s = times_of(bodies, {0: first, 5: second}, {0: np.array([*wanted, 0.0, 0.0, 0.0]), 5: STILL}, math.inf, pairs)
     return times_s[0], times_s[5]
 
 
@@ -110,14 +115,11 @@ def test_hull_of_a_turned_module_is_as_large_as_its_corners_reach(rotation: int)
 
 @pytest.mark.parametrize("signs", list(product((-1.0, 1.0), repeat=3)))
 def test_hull_counts_as_the_upright_cylinder_about_its_corners(signs: tuple[float, float, float]) -> None:
-    """A long flat hull, tilted and turned each way, off the middle of a body that moves and turns."""
+    """A long flat hull, tilted and turned each way."""
     q_wb, hull_m = from_euler(*np.multiply(signs, [0.4, 0.3, 0.7])), np.array([0.6, 0.3, 0.1])
-    p_wb, nu, r_bm = np.array([0.3, -0.2, 1.0]), np.array([0.1, 0.2, -0.3, 0.4, -0.5, 0.6]), np.array([0.2, 0.1, -0.3])
-    r_w, v_w, cylinder = in_world(p_wb, q_wb, nu, r_bm[None], hull_m[None])
+    cylinder = cylinders(q_wb[None], np.zeros(1, dtype=np.int64), hull_m[None])
     turn = Rotation.from_quat(q_wb[[1, 2, 3, 0]])
     corners = turn.apply(0.5 * hull_m * list(product((-1.0, 1.0), repeat=3)))
-    assert r_w == pytest.approx((p_wb + turn.apply(r_bm))[None])
-    assert v_w == pytest.approx(turn.apply(nu[:3] + np.cross(nu[3:], r_bm))[None])
     assert cylinder == pytest.approx(np.array([[np.hypot(corners[:, 0], corners[:, 1]).max(), corners[:, 2].max()]]))
 
 
@@ -132,7 +134,7 @@ def test_time_within_reach_is_that_of_a_parabola_below_zero() -> None:
 def test_hull_that_grazes_another_touches_it() -> None:
     hulls = [dataclasses.replace(single(number), hull_m=np.array([[0.6, 0.8, 0.4]])) for number in (0, 5)]
     estimates = {0: at([0.0, 0.0, 1.0], [0.5, 0.0, 0.0]), 5: at([2.0, 1.0, 1.0])}
-    assert times_of(hulls, estimates, {0: ZERO, 5: ZERO}, math.inf)[0] == 4.0
+    assert times_of(hulls, estimates, {0: STILL, 5: STILL}, math.inf)[0] == 4.0
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -140,16 +142,19 @@ def test_times_of_many_bodies_are_those_of_small_steps(seed: int) -> None:
     """Against a march in steps of 1 ms of every module of three bodies, each of which moves on while the others do."""
     rng = np.random.default_rng(seed)
     bodies = [at_once(assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [MODCUBE] * 2, [0, 1])), single(2), single(3)]
-    places = np.array([[-0.6, -0.5, 1.0], [1.2, 0.1, 1.2], [-0.2, 1.4, 0.9]]) + rng.uniform(-0.2, 0.2, (3, 3))
+    places_w = np.array([[-0.6, -0.5, 1.0], [1.2, 0.1, 1.2], [-0.2, 1.4, 0.9]]) + rng.uniform(-0.2, 0.2, (3, 3))
     turns = [from_euler(*rng.uniform(-3.0, 3.0, 3)) for _ in bodies]
-    flights = [0.2 * (np.array([0.3, 0.4, 1.0]) - place) + rng.uniform(-0.1, 0.1, 3) for place in places]
+    flights = [0.2 * (np.array([0.3, 0.4, 1.0]) - place) + rng.uniform(-0.1, 0.1, 3) for place in places_w]
     estimates = {
         body.index: at(place, rotate_back(q_wb, v_w), q_wb=q_wb)
-        for body, place, q_wb, v_w in zip(bodies, places, turns, flights, strict=True)
+        for body, place, q_wb, v_w in zip(bodies, places_w, turns, flights, strict=True)
     }
-    seen = [in_world(*estimates[body.index][:3], body.r_bm, body.hull_m) for body in bodies]
+    seen = [
+        (world(np.r_[ZERO, q_wb]).apply(body.r_bm) + place, np.tile(v_w, (len(body.modules), 1)), reaches(body, q_wb))
+        for body, place, q_wb, v_w in zip(bodies, places_w, turns, flights, strict=True)
+    ]
     t = np.arange(0.0, 12.0, 1e-3)[:, None]
-    times = times_of(bodies, estimates, {body.index: ZERO for body in bodies}, math.inf)
+    times = times_of(bodies, estimates, {body.index: STILL for body in bodies}, math.inf)
 
     def first_touch(i: int) -> float:
         firsts = [math.nan]
@@ -219,19 +224,60 @@ def test_body_that_waits_before_another_has_the_time_that_it_would_need() -> Non
     assert pair(moving, other)[0] == pytest.approx((1.0 - TOUCH_M) / 0.1)
 
 
-def test_corner_of_a_turning_row_counts_with_its_own_speed() -> None:
-    """A row of three turns in place: its end comes round to a body that its middle does not approach."""
-    row, other = at_once(assemble([(-1, 0, 0), (0, 0, 0), (1, 0, 0)], [0] * 3, [MODCUBE] * 3, [1, 2, 3])), single(8)
-    turning = at([0.0, 0.0, 1.0], turn=1.0)
-    estimates = {1: turning, 8: at([PITCH_M, 0.6, 1.0])}
-    times = times_of([row, other], estimates, {1: ZERO, 8: ZERO}, math.inf)
-    assert times[1] == pytest.approx((0.6 - TOUCH_M) / PITCH_M, rel=1e-6)
-    assert math.isnan(times[8])
+def row_of_three() -> Body:
+    return at_once(assemble([(-1, 0, 0), (0, 0, 0), (1, 0, 0)], [0] * 3, [MODCUBE] * 3, [1, 2, 3]))
+
+
+@pytest.mark.parametrize("wanted", [False, True], ids=["it turns", "it wants to turn"])
+@pytest.mark.parametrize("tilt", [LEVEL, from_euler(0.5, 0.3, 0.2)], ids=["level", "tilted"])
+def test_time_of_a_row_that_turns_is_that_of_its_modules_on_their_arcs(wanted: bool, tilt: np.ndarray) -> None:
+    """A row of three, against a march in steps of 1 ms of all its modules; each of its pieces leaves the arc by a share of the arm."""
+    row, other, rate = row_of_three(), single(8), np.array([0.0, 0.0, 1.5])
+    t_s = np.arange(0.0, 2.0, 1e-3)[:, None]
+    off_m = (1.0 - math.cos(math.pi / PIECES)) * PITCH_M
+    for bearing in np.radians([75.0, 100.0, 120.0, 250.0]):
+        place = Rotation.from_quat(tilt[[1, 2, 3, 0]]).apply([0.45 * math.cos(bearing), 0.45 * math.sin(bearing), 0.02])
+        drift_w = np.array([0.02, -0.03, 0.01])
+        motion = np.r_[rotate_back(tilt, drift_w), rate]
+        estimates = {1: at(ZERO, q_wb=tilt), 8: at(place)}
+        if not wanted:
+            estimates[1] = estimates[1]._replace(nu=motion)
+        time_s = times_of([row, other], estimates, {1: np.r_[drift_w, rate] if wanted else STILL, 8: STILL}, math.inf)[1]
+        (arm, height), (radius, half) = reaches(row, tilt)[0], reaches(other, LEVEL)[0]
+        spins = Rotation.from_quat(tilt[[1, 2, 3, 0]]) * Rotation.from_rotvec(t_s * rate)
+        gaps = [place - t_s * drift_w - spins.apply(r_b) for r_b in row.r_bm]
+
+        def touch_s(wider_m: float, gaps: list[np.ndarray] = gaps, reach: tuple[float, float] = (arm + radius, height + half)) -> float:
+            near = [(np.hypot(*gap[:, :2].T) <= reach[0] + wider_m) & (abs(gap[:, 2]) <= reach[1] + wider_m) for gap in gaps]
+            return float(t_s[np.any(near, axis=0)][0, 0])
+
+        assert touch_s(off_m) - 1e-3 <= time_s <= touch_s(-off_m) + 1e-3
+        assert touch_s(-off_m) - touch_s(off_m) < 0.1, "the two are close"
+
+
+def test_body_beside_the_sweep_of_a_row_is_not_in_its_way() -> None:
+    """The end of the row heads for it, and bends off."""
+    row, other, turning = row_of_three(), single(8), at([0.0, 0.0, 1.0], turn=1.0)
+    reach_m = PITCH_M + TOUCH_M
+    for far_m in (1.02 * reach_m, 0.9 * reach_m):
+        place = [PITCH_M, math.sqrt(far_m**2 - PITCH_M**2), 1.0]
+        times = times_of([row, other], {1: turning, 8: at(place)}, {1: STILL, 8: STILL}, math.inf)
+        assert math.isnan(times[8]) and math.isnan(times[1]) == (far_m > reach_m)
+
+
+def test_row_that_turns_slowly_is_followed_straight_on() -> None:
+    """The turn alone carries its modules along too slowly to count; a faster one carries its end away from a body before it."""
+    row, other = row_of_three(), single(8)
+    for rate, before_it in ((0.99 * OWN_M_S / PITCH_M, True), (0.3, False)):
+        here, there = at([0.0, 0.0, 1.0], [0.1, 0.0, 0.0], turn=rate), at([0.0, 0.0, 1.0])
+        time_s = times_of([row, other], {1: here, 8: there._replace(p_wb=np.array([2.0, 0.0, 1.0]))}, {1: STILL, 8: STILL}, math.inf)[1]
+        exact_s = (2.0 - PITCH_M - TOUCH_M) / 0.1
+        assert (time_s == pytest.approx(exact_s)) == before_it
 
 
 def test_vehicle_alone_has_nobody_to_meet() -> None:
     alone = at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0])
-    assert math.isnan(times_of([assemble_vehicle(MODCUBE)], {0: alone}, {0: np.array([0.2, 0.0, 0.0])}, 6.0)[0])
+    assert math.isnan(times_of([assemble_vehicle(MODCUBE)], {0: alone}, {0: np.array([0.2, *STILL[1:]])}, 6.0)[0])
 
 
 @pytest.mark.parametrize(("speed", "bandwidth"), [(0.1, 6.0), (0.3, 1.0), (1.0, 6.0), (2.0, 30.0)])
@@ -252,10 +298,10 @@ def test_time_to_brake_is_that_to_the_collision_less_the_braking() -> None:
     bodies = [assemble([(0, 0, 0)], [0], [MODCUBE], [number]) for number in (0, 5)]
     estimates = {0: at(ZERO, [0.2, 0.0, 0.0]), 5: at([1.0, 0.0, 0.0])}
     alone_s = (1.0 - TOUCH_M) / 0.2 - braking_s(np.array([0.2, 0.0]), bodies[0].deceleration, 6.0)
-    assert times_of(bodies, estimates, {0: ZERO, 5: ZERO}, 6.0)[0] == pytest.approx(alone_s)
+    assert times_of(bodies, estimates, {0: STILL, 5: STILL}, 6.0)[0] == pytest.approx(alone_s)
     wanted_s = (1.0 - TOUCH_M) / 0.4 - braking_s(np.array([0.4, 0.0]), bodies[0].deceleration, 6.0)
-    assert times_of(bodies, estimates, {0: np.array([0.4, 0.0, 0.0]), 5: ZERO}, 6.0)[0] == pytest.approx(wanted_s)
-    assert times_of(bodies, estimates, {0: ZERO, 5: ZERO}, 0.1)[0] == 0.0, "it brakes too late"
+    assert times_of(bodies, estimates, {0: np.array([0.4, *STILL[1:]]), 5: STILL}, 6.0)[0] == pytest.approx(wanted_s)
+    assert times_of(bodies, estimates, {0: STILL, 5: STILL}, 0.1)[0] == 0.0, "it brakes too late"
 
 
 def test_deceleration_is_that_of_the_weakest_axis_which_is_steered() -> None:
@@ -293,7 +339,7 @@ def test_body_without_any_thrust_along_an_axis_brakes_along_the_others() -> None
     half = dataclasses.replace(MODCUBE, thruster=MODCUBE.thruster[:4])
     bodies = [assemble([(0, 0, 0)], [0], [half], [number]) for number in (0, 5)]
     assert all(bodies[0].deceleration > 0.0) and np.isfinite(bodies[0].deceleration[0])
-    times_s = times_of(bodies, {0: at(ZERO), 5: at([1.0, 0.0, 0.0])}, {0: np.array([0.4, 0.0, 0.0]), 5: ZERO}, 6.0)
+    times_s = times_of(bodies, {0: at(ZERO), 5: at([1.0, 0.0, 0.0])}, {0: np.array([0.4, *STILL[1:]]), 5: STILL}, 6.0)
     assert 0.0 < times_s[0] < (1.0 - TOUCH_M) / 0.4
 
 
@@ -378,19 +424,44 @@ def test_body_that_is_sent_on_and_on_waits_and_goes_on_when_the_way_is_free(insi
 
 
 @pytest.mark.slow
-def test_row_of_nine_that_turns_fast_stops_before_another() -> None:
-    """Regression: it counted as if every thruster gave all its force to the turn, and stopped 0.26 m from the other's middle."""
-    tank = FaultyTank([(i, 0, 0) for i in range(10)], Parameters().replace("steering.rate_rad_s", 1.5), each=9)
-    for state, place in zip(tank.states, ((0.0, 0.0), (0.42, 0.42 * 3.0**0.5)), strict=True):
+@pytest.mark.parametrize(
+    ("rate_rad_s", "bearing_deg", "insists"),
+    [(1.5, 60.0, False), (3.0, 60.0, False), (1.5, 110.0, False), (1.0, 60.0, True), (1.0, 90.0, True)],
+)
+def test_row_of_nine_that_is_sent_round_stops_before_another(rate_rad_s: float, bearing_deg: float, insists: bool) -> None:
+    """Regression: nobody asked where the turn that it wanted would lead. Sent at 3 rad/s it stopped 0.23 m from the other's middle, and a
+    yaw stick that was held (`insists`) carried it through the other.
+    """
+    tank = FaultyTank([(i, 0, 0) for i in range(10)], Parameters().replace("steering.rate_rad_s", rate_rad_s), each=9)
+    bearing = math.radians(bearing_deg)
+    for state, place in zip(tank.states, ((0.0, 0.0), (0.84 * math.cos(bearing), 0.84 * math.sin(bearing))), strict=True):
         state[:7] = [*place, 1.5, *LEVEL]
     tank.run(2.0)
     tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 9))
     round_about = Setpoint(np.array([0.0, 0.0, 1.5]), from_euler(0.0, 0.0, 3.05), ZERO, ZERO, ZERO, ZERO)
-    tank.run(3.0, Request(Action.HOLD, 0, round_about))
+    if insists:
+        for _ in range(40):
+            tank.run(0.1, Request(Action.STICKS, 0, Sticks((0.0, 0.0, 0.0), (0.0, 0.0, 1.0))))
+    else:
+        tank.run(3.0, Request(Action.HOLD, 0, round_about))
     assert tank.when("fail-safe on: another body is in the way")
     row = tank.bodies[0].r_bm
     gaps_m = [np.linalg.norm(states[0][:3] + world(states[0]).apply(row) - states[1][:3], axis=1).min() for states in tank.past]
-    assert min(gaps_m) > TOUCH_M
+    assert min(gaps_m) > TOUCH_M and abs(tank.states[0][12]) < 0.05
+
+
+@pytest.mark.slow
+def test_row_may_be_turned_until_just_before_another() -> None:
+    """Its end comes within 5 cm of where the two can touch."""
+    tank = FaultyTank([(i, 0, 0) for i in range(10)], Parameters(), each=9)
+    for state, place in zip(tank.states, ((0.0, 0.0), (0.42, 0.42 * 3.0**0.5)), strict=True):
+        state[:7] = [*place, 1.5, *LEVEL]
+    tank.run(2.0)
+    tank.run(0.5, Request(Action.ARM, 0), Request(Action.ARM, 9))
+    before = from_euler(0.0, 0.0, math.radians(37.0))
+    tank.run(4.0, Request(Action.HOLD, 0, Setpoint(np.array([0.0, 0.0, 1.5]), before, ZERO, ZERO, ZERO, ZERO)))
+    assert not any("another body" in said for _, said in tank.event_log)
+    assert world(tank.states[0]).as_euler("ZYX", degrees=True)[0] == pytest.approx(37.0, abs=1.0)
 
 
 @pytest.mark.slow
