@@ -239,9 +239,12 @@ class Steering:
     def _place(
         self, now: np.ndarray, position: np.ndarray | None, velocity: np.ndarray | None, time_ns: int
     ) -> np.ndarray:
-        """Returns the position to hold: as requested; on an axis without a position moved on by the velocity, or unchanged."""
+        """Returns the position to hold: as requested; on an axis without a position moved on by the velocity, or unchanged. An axis
+        whose velocity has just ended stays where the body was to be: at the fence, or before another body, its place was ahead of that.
+        """
         start, elapsed_s = self._before(time_ns)
-        before = now if start is None else start.p_wb
+        going = np.zeros(3) if velocity is None else velocity
+        before = now if start is None else np.where((going == 0.0) & (start.v_w != 0.0), now, start.p_wb)
         at = self._system.subject.record.estimate.p_wb
         moved = before if velocity is None else _reined_in(before, at, velocity) + velocity * elapsed_s
         return np.asarray(moved if position is None else np.where(np.isnan(position), moved, position))
@@ -272,8 +275,7 @@ class Steering:
             return
         if not self._system.body_is_known:
             return
-        start, _ = self._before(arrival.time_ns)
-        p_wb = (start or self._system.subject.record.setpoint).p_wb
+        p_wb = self._place(self._system.subject.record.setpoint.p_wb, None, None, arrival.time_ns)
         zero = np.zeros(3)
         self._stream(Setpoint(p_wb, np.asarray(normalise(q)), zero, zero, zero, zero), arrival)
 

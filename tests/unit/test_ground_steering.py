@@ -160,14 +160,34 @@ def test_velocity_setpoints_move_the_place_along(world: World, client: Client) -
     assert setpoints[-1].p_wb[0] - world.robot.p_wb[0][0] == pytest.approx(0.09, abs=0.02)
 
 
-def test_velocity_of_zero_stops_a_body_that_could_not_follow(world: World, client: Client) -> None:
+@pytest.mark.parametrize("stop", ["velocity of zero", "no velocity", "attitude"])
+def test_body_that_could_not_follow_a_velocity_stops_where_it_was_to_be(world: World, client: Client, stop: str) -> None:
+    """Regression: the place had run ahead by a metre, and a body that the fence had held drifted there when the fence was widened."""
+    record, held = world.robot._record, world.robot.p_wb[0] + np.array([0.05, 0.0, 0.0])
+    world.robot._record = lambda body: (r := record(body))._replace(setpoint=r.setpoint._replace(p_wb=held))  # type: ignore[method-assign]
     fly_by_velocity(world, client)
-    for vx in (*[2.0] * 50, 0.0):
-        send_target(client, 0xDC7, vx=vx)
+    for vx in (2.0,) * 50:
+        send_target(client, 0xDC7, vx=vx, vy=0.1)
         world.run(10)
-    stop = [r.argument for r in world.robot.asked if r.action == Action.SET_POINT][-1]
-    assert stop.v_w == pytest.approx([0, 0, 0])
-    assert 0.5 < stop.p_wb[0] - world.robot.p_wb[0][0] <= 1.0 + 1e-6
+    ahead = world.robot.asked[-1].argument.p_wb
+    assert 0.5 < ahead[0] - world.robot.p_wb[0][0] <= 1.0 + 2.0 * 0.1 + 1e-6
+    for _ in range(2):
+        if stop == "attitude":
+            client.send("SET_ATTITUDE_TARGET", 0, 1, 1, 0x7, [1.0, 0.0, 0.0, 0.0], 0.0, 0.0, 0.0, 0.0)
+        else:
+            send_target(client, 0xDC7 if stop == "velocity of zero" else 0xDF8 | 3, z=held[2])
+        world.run(10)
+        stopped = world.robot.asked[-1].argument
+        assert stopped.v_w == pytest.approx([0.0, 0.0, 0.0]) and stopped.p_wb == pytest.approx(held, abs=1e-6)
+
+
+def test_axis_of_a_velocity_that_goes_on_keeps_its_place(world: World, client: Client) -> None:
+    fly_by_velocity(world, client)
+    for vx in (*[0.1] * 30, 0.0):
+        send_target(client, 0xDC7, vx=vx, vy=0.1)
+        world.run(10)
+    ahead = world.robot.asked[-1].argument.p_wb - world.robot.p_wb[0]
+    assert ahead[0] == pytest.approx(0.0, abs=1e-9) and ahead[1] > 0.25
 
 
 def test_velocity_back_is_obeyed_at_once_by_a_body_that_could_not_follow(world: World, client: Client) -> None:
