@@ -84,13 +84,14 @@ def times_to_brake(
 @njit(f"{M}(float64,{M},{M},{M},int64[::1],{M})", cache=True)
 def places(t_s, p_wb, q_wb, motion, of_body, r_bm):  # type: ignore[no-untyped-def]
     """(m, 3) places of all modules in the world, m, after `t_s` at `motion`: (b, 6) velocity, world, and turning rate, body, of each."""
-    r_w = np.empty_like(r_bm)
+    q_then, r_w = np.empty_like(q_wb), np.empty_like(r_bm)
+    for b in range(len(q_wb)):
+        q_then[b] = multiply(q_wb[b], exp(t_s * motion[b, 3:]))
     for m in range(of_body.size):
         b = of_body[m]
-        if m == 0 or b != of_body[m - 1]:
-            p_then, q_then = p_wb[b] + t_s * motion[b, :3], multiply(q_wb[b], exp(t_s * motion[b, 3:]))
-        north, east, down = turned(q_then, r_bm[m, 0], r_bm[m, 1], r_bm[m, 2])
-        r_w[m, 0], r_w[m, 1], r_w[m, 2] = p_then[0] + north, p_then[1] + east, p_then[2] + down
+        arm = turned(q_then[b], r_bm[m, 0], r_bm[m, 1], r_bm[m, 2])
+        for axis in range(3):
+            r_w[m, axis] = p_wb[b, axis] + t_s * motion[b, axis] + arm[axis]
     return r_w
 
 
@@ -151,13 +152,14 @@ def _soonest(p_wb, q_wb, own, now, of_body, r_bm, hull_m, ignored):  # type: ign
             rate = math.sqrt((motion[of_body[m], 3:] ** 2).sum())
             if rate * math.sqrt((r_bm[m] ** 2).sum()) > OWN_M_S:
                 fastest = max(fastest, rate)
-    pieces, piece_s = (PIECES, 2.0 * math.pi / PIECES / fastest) if fastest > 0.0 else (0, 0.0)
-    out, cylinder = np.full(len(ignored), np.nan), cylinders(q_wb, of_body, hull_m)
+    out, cylinder, begins_s = np.full(len(ignored), np.nan), cylinders(q_wb, of_body, hull_m), 0.0
     own_r, r_w = places(0.0, p_wb, q_wb, own, of_body, r_bm), places(0.0, p_wb, q_wb, now, of_body, r_bm)
-    for k in range(pieces):
-        own_then = places((k + 1) * piece_s, p_wb, q_wb, own, of_body, r_bm)
-        then = places((k + 1) * piece_s, p_wb, q_wb, now, of_body, r_bm)
-        _meet(own_r, (own_then - own_r) / piece_s, r_w, (then - r_w) / piece_s, cylinder, of_body, ignored, k * piece_s, piece_s, out)
-        own_r, r_w = own_then, then
-    _meet(own_r, own[:, :3][of_body], r_w, now[:, :3][of_body], cylinder, of_body, ignored, pieces * piece_s, math.inf, out)
+    if fastest > 0.0:
+        piece_s = 2.0 * math.pi / PIECES / fastest
+        for _ in range(PIECES):
+            own_then = places(begins_s + piece_s, p_wb, q_wb, own, of_body, r_bm)
+            then = places(begins_s + piece_s, p_wb, q_wb, now, of_body, r_bm)
+            _meet(own_r, (own_then - own_r) / piece_s, r_w, (then - r_w) / piece_s, cylinder, of_body, ignored, begins_s, piece_s, out)
+            own_r, r_w, begins_s = own_then, then, begins_s + piece_s
+    _meet(own_r, own[:, :3][of_body], r_w, now[:, :3][of_body], cylinder, of_body, ignored, begins_s, math.inf, out)
     return out

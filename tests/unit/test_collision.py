@@ -231,28 +231,30 @@ def row_of_three() -> Body:
 @pytest.mark.parametrize("wanted", [False, True], ids=["it turns", "it wants to turn"])
 @pytest.mark.parametrize("tilt", [LEVEL, from_euler(0.5, 0.3, 0.2)], ids=["level", "tilted"])
 def test_time_of_a_row_that_turns_is_that_of_its_modules_on_their_arcs(wanted: bool, tilt: np.ndarray) -> None:
-    """A row of three, against a march in steps of 1 ms of all its modules; each of its pieces leaves the arc by a share of the arm."""
+    """A row of three and a body that nears it, against a march in steps of 1 ms. A straight piece leaves its arc by a share of the arm."""
     row, other, rate = row_of_three(), single(8), np.array([0.0, 0.0, 1.5])
-    t_s = np.arange(0.0, 2.0, 1e-3)[:, None]
     off_m = (1.0 - math.cos(math.pi / PIECES)) * PITCH_M
+    assert off_m == pytest.approx(0.019 * PITCH_M, rel=0.02)
+    t_s = np.arange(0.0, 2.0, 1e-3)[:, None]
+    spins = Rotation.from_quat(tilt[[1, 2, 3, 0]]) * Rotation.from_rotvec(t_s * rate)
+    (radius, height), (other_radius, other_height) = reaches(row, tilt)[0], reaches(other, LEVEL)[0]
+    drift_w = np.array([0.02, -0.03, 0.01])
     for bearing in np.radians([75.0, 100.0, 120.0, 250.0]):
-        place = Rotation.from_quat(tilt[[1, 2, 3, 0]]).apply([0.45 * math.cos(bearing), 0.45 * math.sin(bearing), 0.02])
-        drift_w = np.array([0.02, -0.03, 0.01])
+        place = Rotation.from_quat(tilt[[1, 2, 3, 0]]).apply([0.5 * math.cos(bearing), 0.5 * math.sin(bearing), 0.02])
+        coming_w = -0.3 * place
         motion = np.r_[rotate_back(tilt, drift_w), rate]
-        estimates = {1: at(ZERO, q_wb=tilt), 8: at(place)}
-        if not wanted:
-            estimates[1] = estimates[1]._replace(nu=motion)
-        time_s = times_of([row, other], estimates, {1: np.r_[drift_w, rate] if wanted else STILL, 8: STILL}, math.inf)[1]
-        (arm, height), (radius, half) = reaches(row, tilt)[0], reaches(other, LEVEL)[0]
-        spins = Rotation.from_quat(tilt[[1, 2, 3, 0]]) * Rotation.from_rotvec(t_s * rate)
-        gaps = [place - t_s * drift_w - spins.apply(r_b) for r_b in row.r_bm]
+        first = at(ZERO, q_wb=tilt) if wanted else at(ZERO, q_wb=tilt, nu=motion)
+        asked = {1: np.r_[drift_w, rate] if wanted else STILL, 8: STILL}
+        times = times_of([row, other], {1: first, 8: at(place, coming_w)}, asked, math.inf)
+        gaps = [place + t_s * (coming_w - drift_w) - spins.apply(r_b) for r_b in row.r_bm]
 
-        def touch_s(wider_m: float, gaps: list[np.ndarray] = gaps, reach: tuple[float, float] = (arm + radius, height + half)) -> float:
-            near = [(np.hypot(*gap[:, :2].T) <= reach[0] + wider_m) & (abs(gap[:, 2]) <= reach[1] + wider_m) for gap in gaps]
-            return float(t_s[np.any(near, axis=0)][0, 0])
+        def touch_s(wider_m: float, gaps: list[np.ndarray] = gaps) -> float:
+            level_m, up_m = radius + other_radius + wider_m, height + other_height + wider_m
+            return float(t_s[np.any([(np.hypot(*gap[:, :2].T) <= level_m) & (abs(gap[:, 2]) <= up_m) for gap in gaps], axis=0)][0, 0])
 
-        assert touch_s(off_m) - 1e-3 <= time_s <= touch_s(-off_m) + 1e-3
-        assert touch_s(-off_m) - touch_s(off_m) < 0.1, "the two are close"
+        earliest_s, latest_s = touch_s(off_m) - 1e-3, touch_s(-off_m) + 1e-3
+        assert 0.05 < earliest_s <= times[1] <= latest_s < earliest_s + 0.1
+        assert wanted or times[8] == times[1], "the other meets it as it turns"
 
 
 def test_body_beside_the_sweep_of_a_row_is_not_in_its_way() -> None:
@@ -265,14 +267,21 @@ def test_body_beside_the_sweep_of_a_row_is_not_in_its_way() -> None:
         assert math.isnan(times[8]) and math.isnan(times[1]) == (far_m > reach_m)
 
 
-def test_row_that_turns_slowly_is_followed_straight_on() -> None:
-    """The turn alone carries its modules along too slowly to count; a faster one carries its end away from a body before it."""
-    row, other = row_of_three(), single(8)
-    for rate, before_it in ((0.99 * OWN_M_S / PITCH_M, True), (0.3, False)):
-        here, there = at([0.0, 0.0, 1.0], [0.1, 0.0, 0.0], turn=rate), at([0.0, 0.0, 1.0])
-        time_s = times_of([row, other], {1: here, 8: there._replace(p_wb=np.array([2.0, 0.0, 1.0]))}, {1: STILL, 8: STILL}, math.inf)[1]
-        exact_s = (2.0 - PITCH_M - TOUCH_M) / 0.1
-        assert (time_s == pytest.approx(exact_s)) == before_it
+def test_body_whose_turn_carries_its_modules_slowly_is_followed_straight_on() -> None:
+    one = dataclasses.replace(single(1), r_bm=np.array([[1.0, 0.0, 0.0]]))
+    exact_s = (2.0 - 1.0 - TOUCH_M) / 0.1
+    for rate, straight in ((OWN_M_S, True), (1.01 * OWN_M_S, False)):
+        estimates = {1: at([0.0, 0.0, 1.0], [0.1, 0.0, 0.0], turn=rate), 8: at([2.0, 0.0, 1.0])}
+        time_s = times_of([one, single(8)], estimates, {1: STILL, 8: STILL}, math.inf)[1]
+        assert (time_s == pytest.approx(exact_s, rel=1e-9)) == straight
+
+
+def test_bodies_go_straight_on_after_a_whole_turn_of_the_fastest() -> None:
+    """A row that spins far away must not hide what a body swims into later."""
+    row, bodies = row_of_three(), [single(8), single(9)]
+    estimates = {1: at([0.0, 9.0, 1.0], turn=3.0), 8: at([0.0, 0.0, 1.0], [0.2, 0.0, 0.0]), 9: at([2.0, 0.0, 1.0])}
+    times = times_of([row, *bodies], estimates, {1: STILL, 8: STILL, 9: STILL}, math.inf)
+    assert times[8] == pytest.approx((2.0 - TOUCH_M) / 0.2, rel=1e-9) and math.isnan(times[1])
 
 
 def test_vehicle_alone_has_nobody_to_meet() -> None:
