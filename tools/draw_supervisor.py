@@ -38,9 +38,9 @@ WATCHED = """\
 - `fence`: it counts only where the body goes by itself. A body that it stops holds its place where it is. In an ALT_HOLD that a fail-safe
   chose it only tells, unless its action is graver than that fail-safe's.
 - `collision`: the time that is left before the body must brake, to stop before another body of the same fleet towards which it moves or
-  turns, or wants to. Both must have seen tags, and near each other by more than 8 cm/s, 4 cm/s of it by the body's own motion. The two
-  bodies of a dock do not count for each other, nor do the two pieces of an undock for three seconds. In DOCK a body waits for others by
-  itself.
+  turns, or wants to. Both must have seen tags, and near each other by more than 8 cm/s, 4 cm/s of it by the body's own motion. A body
+  without tags keeps others 5 cm farther off for each second, up to 1 m. The two bodies of a dock do not count for each other, nor do the
+  two pieces of an undock for three seconds. In DOCK a body waits for others by itself.
 - `ground_lost`: the ground station that is watched ([ground-station.md](ground-station.md#connect))."""
 AFTERWARDS = """\
 A fail-safe forbids other modes only among those in which it is active: while the pilot is silent, AUTO may be chosen.

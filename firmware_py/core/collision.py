@@ -1,8 +1,9 @@
 """Time that each body has left before it must brake to stop before another: a figure of the health (`collision_s`).
 
 All bodies move and turn on as they do now; and each, besides, as its guidance wants to: one that waits before another would reach it as
-soon as it goes on. A hull counts as the upright cylinder about its box as it is turned now. Braking takes the longer way of the
-set-point, which changes speed through a filter, and of thrusters that are too weak to follow it.
+soon as it goes on. A hull counts as the upright cylinder about its box as it is turned now, wider by
+how far the body may have drifted since its last tag. Braking takes the longer way of the set-point, which changes speed through a filter,
+and of thrusters that are too weak to follow it.
 """
 
 from __future__ import annotations
@@ -21,6 +22,9 @@ from firmware_py.core.types import Estimate
 CLOSING_M_S, OWN_M_S = 0.08, 0.04
 """Speed at which two modules must near each other to count, and the least part of it that must be a body's own, so that it can help. A hull
 bears a slower bump (docks touch at up to 0.06), and a body may pass close by another slowly."""
+DRIFT_M_S, MOST_DRIFT_M = 0.05, 1.0
+"""Speed at which a body may have been carried off since its last tag, that of the plant's mean current (synthetic), and how far it may
+be at most: a body that keeps out of sight for longer surfaces, and must not bar a whole tank."""
 PIECES = 16
 """Straight pieces in which modules that a turn carries along are followed, for a whole turn of the body that turns fastest. The arc leaves
 its piece by 2 % of its radius."""
@@ -73,11 +77,14 @@ def times_to_brake(
     p_wb, q_wb, now = (np.array(parts) for parts in zip(*(estimates[number][:3] for number in numbers), strict=True))
     for motion, attitude in zip(now, q_wb, strict=True):
         motion[:3] = rotate(attitude, motion[:3].copy())
+    cylinder = cylinders(q_wb, of_body, hull_m)
+    unseen_s = 1e-9 * np.array([estimates[number].tag_age_ns for number in numbers])
+    cylinder[:, 0] += np.minimum(DRIFT_M_S * unseen_s, MOST_DRIFT_M)[of_body]
     slowing = np.array([deceleration[number] for number in numbers])
     left = []
     for own in (now, np.array([wanted[number] for number in numbers])):
         speeds = np.linalg.norm(own.reshape(-1, 2, 3), axis=2)
-        left.append(_soonest(p_wb, q_wb, own, now, of_body, r_bm, hull_m, ignored) - braking_s(speeds, slowing, bandwidth))
+        left.append(_soonest(p_wb, q_wb, own, now, of_body, r_bm, cylinder, ignored) - braking_s(speeds, slowing, bandwidth))
     return times | dict(zip(numbers, np.maximum(np.fmin(*left), 0.0).tolist(), strict=True))
 
 
@@ -142,7 +149,7 @@ def _meet(own_r, own_w, r_w, v_w, cylinder, of_body, ignored, begins_s, lasts_s,
 
 
 @njit(f"{V}({M},{M},{M},{M},int64[::1],{M},{M},boolean[:,::1])", cache=True)
-def _soonest(p_wb, q_wb, own, now, of_body, r_bm, hull_m, ignored):  # type: ignore[no-untyped-def]
+def _soonest(p_wb, q_wb, own, now, of_body, r_bm, cylinder, ignored):  # type: ignore[no-untyped-def]
     """(b,) the least time to collision, s; NaN where there is none. Each body moves at its motion in `own`, (b, 6) as in `places`, while
     the others move at theirs in `now`. All go straight on after a whole turn, or at once if no turn carries a module along fast enough.
     """
@@ -152,7 +159,7 @@ def _soonest(p_wb, q_wb, own, now, of_body, r_bm, hull_m, ignored):  # type: ign
             rate = math.sqrt((motion[of_body[m], 3:] ** 2).sum())
             if rate * math.sqrt((r_bm[m] ** 2).sum()) > OWN_M_S:
                 fastest = max(fastest, rate)
-    out, cylinder, begins_s = np.full(len(ignored), np.nan), cylinders(q_wb, of_body, hull_m), 0.0
+    out, begins_s = np.full(len(ignored), np.nan), 0.0
     own_r, r_w = places(0.0, p_wb, q_wb, own, of_body, r_bm), places(0.0, p_wb, q_wb, now, of_body, r_bm)
     if fastest > 0.0:
         piece_s = 2.0 * math.pi / PIECES / fastest

@@ -11,7 +11,7 @@ from scipy.optimize import linprog
 from scipy.spatial.transform import Rotation
 
 from firmware_py.core.body import Body, deceleration_of
-from firmware_py.core.collision import CLOSING_M_S, OWN_M_S, PIECES, braking_s, cylinders, times_to_brake, within
+from firmware_py.core.collision import CLOSING_M_S, DRIFT_M_S, MOST_DRIFT_M, OWN_M_S, PIECES, braking_s, cylinders, times_to_brake, within
 from firmware_py.core.rotations import from_euler, rotate_back
 from firmware_py.core.setpoint import REST, Glider
 from firmware_py.core.types import NEVER_AGE_NS, Action, EscFeedback, Estimate, Mode, Request, Setpoint, Sticks
@@ -212,6 +212,17 @@ def test_pair_that_docks_is_to_touch_and_a_third_body_is_not() -> None:
     for pairs in (((0, 5),), ((5, 0),)):
         assert np.isnan(pair(moving, waiting, pairs)).all()
     assert pair(moving, waiting, ((0, 7), (7, 5)))[0] > 0.0
+
+
+def test_body_out_of_sight_keeps_others_farther_off() -> None:
+    """It counted for minutes as exactly where its last tag was, and a body swam into where a current had carried it."""
+    moving = at(ZERO, [0.2, 0.0, 0.0])
+    for unseen_s in (0.0, 1.0, 15.0, 300.0):
+        there = at([3.0, 0.0, 0.0], tag_age_ns=round(unseen_s * 1e9))
+        assert pair(moving, there)[0] == pytest.approx((3.0 - TOUCH_M - min(DRIFT_M_S * unseen_s, MOST_DRIFT_M)) / 0.2, rel=1e-9)
+        assert pair(moving._replace(tag_age_ns=there.tag_age_ns), at([3.0, 0.0, 0.0]))[0] == pair(moving, there)[0]
+    assert math.isnan(pair(moving, at([3.0, 0.0, 1.01 * EDGE_M], tag_age_ns=300 * 10**9))[0]), "its depth is known"
+    assert (DRIFT_M_S, MOST_DRIFT_M) == (0.05, 1.0)
 
 
 def test_body_that_waits_before_another_has_the_time_that_it_would_need() -> None:
