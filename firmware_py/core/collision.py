@@ -1,9 +1,9 @@
 """Time that each body has left before it must brake to stop before another: a figure of the health (`collision_s`).
 
 All bodies move and turn on as they do now; and each, besides, as its guidance wants to: one that waits before another would reach it as
-soon as it goes on. A hull counts as the upright cylinder about its box as it is turned now, wider by
-how far the body may have drifted since its last tag. Braking takes the longer way of the set-point, which changes speed through a filter,
-and of thrusters that are too weak to follow it.
+soon as it goes on. A hull counts as the upright cylinder about its box as it is turned now, wider by how far the body may have drifted
+since its last tag. Braking takes the longer way of the set-point, which changes speed through a filter, and of thrusters that are too weak
+to follow it.
 """
 
 from __future__ import annotations
