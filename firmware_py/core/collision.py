@@ -15,7 +15,7 @@ import numpy as np
 from numba import njit
 
 from firmware_py.core.body import Body
-from firmware_py.core.rotations import M, V, exp, multiply, rotate, turned
+from firmware_py.core.rotations import M, V, exp, multiply, turned
 from firmware_py.core.setpoint import way_to_rest_s
 from firmware_py.core.types import Estimate
 
@@ -76,14 +76,14 @@ def times_to_brake(
     r_bm, hull_m = np.concatenate([body.r_bm for body in placed]), np.concatenate([body.hull_m for body in placed])
     p_wb, q_wb, now = (np.array(parts) for parts in zip(*(estimates[number][:3] for number in numbers), strict=True))
     for motion, attitude in zip(now, q_wb, strict=True):
-        motion[:3] = rotate(attitude, motion[:3].copy())
+        motion[:3] = turned(attitude, *motion[:3])
     cylinder = cylinders(q_wb, of_body, hull_m)
     unseen_s = 1e-9 * np.array([estimates[number].tag_age_ns for number in numbers])
     cylinder[:, 0] += np.minimum(DRIFT_M_S * unseen_s, MOST_DRIFT_M)[of_body]
     slowing = np.array([deceleration[number] for number in numbers])
     left = []
     for own in (now, np.array([wanted[number] for number in numbers])):
-        speeds = np.linalg.norm(own.reshape(-1, 2, 3), axis=2)
+        speeds = np.linalg.norm(own.reshape(len(own), 2, 3), axis=2)
         left.append(_soonest(p_wb, q_wb, own, now, of_body, r_bm, cylinder, ignored) - braking_s(speeds, slowing, bandwidth))
     return times | dict(zip(numbers, np.maximum(np.fmin(*left), 0.0).tolist(), strict=True))
 
@@ -128,7 +128,7 @@ def within(excess, rate, speed2):  # type: ignore[no-untyped-def]
 @njit(f"void({M},{M},{M},{M},{M},int64[::1],boolean[:,::1],float64,float64,{V})", cache=True)
 def _meet(own_r, own_w, r_w, v_w, cylinder, of_body, ignored, begins_s, lasts_s, out):  # type: ignore[no-untyped-def]
     """Lowers `out`, (b,), to the least time to collision over all pairs of modules of two bodies, s, in a straight piece of their ways from
-    `begins_s` for `lasts_s`. Each body moves from `own_r` at `own_w`, (m, 3), while the others move from `r_w` at `v_w`, (m, 3).
+    `begins_s` for `lasts_s`. Each body moves from `own_r` at `own_w`, while the others move from `r_w` at `v_w`: (m, 3) or more.
     """
     for i in range(of_body.size):
         for j in range(of_body.size):
@@ -168,5 +168,5 @@ def _soonest(p_wb, q_wb, own, now, of_body, r_bm, cylinder, ignored):  # type: i
             then = places(begins_s + piece_s, p_wb, q_wb, now, of_body, r_bm)
             _meet(own_r, (own_then - own_r) / piece_s, r_w, (then - r_w) / piece_s, cylinder, of_body, ignored, begins_s, piece_s, out)
             own_r, r_w, begins_s = own_then, then, begins_s + piece_s
-    _meet(own_r, own[:, :3][of_body], r_w, now[:, :3][of_body], cylinder, of_body, ignored, begins_s, math.inf, out)
+    _meet(own_r, own[of_body], r_w, now[of_body], cylinder, of_body, ignored, begins_s, math.inf, out)
     return out

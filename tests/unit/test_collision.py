@@ -141,7 +141,7 @@ def test_hull_that_grazes_another_touches_it() -> None:
 def test_times_of_many_bodies_are_those_of_small_steps(seed: int) -> None:
     """Against a march in steps of 1 ms of every module of three bodies, each of which moves on while the others do."""
     rng = np.random.default_rng(seed)
-    bodies = [at_once(assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [MODCUBE] * 2, [0, 1])), single(2), single(3)]
+    bodies = [at_once(assemble([(0, 0, 0), (0, 1, 0)], [0, 0], [MODCUBE] * 2, [0, 1])), single(2), single(3)]
     places_w = np.array([[-0.6, -0.5, 1.0], [1.2, 0.1, 1.2], [-0.2, 1.4, 0.9]]) + rng.uniform(-0.2, 0.2, (3, 3))
     turns = [from_euler(*rng.uniform(-3.0, 3.0, 3)) for _ in bodies]
     flights = [0.2 * (np.array([0.3, 0.4, 1.0]) - place) + rng.uniform(-0.1, 0.1, 3) for place in places_w]
@@ -250,7 +250,7 @@ def test_time_of_a_row_that_turns_is_that_of_its_modules_on_their_arcs(wanted: b
     spins = Rotation.from_quat(tilt[[1, 2, 3, 0]]) * Rotation.from_rotvec(t_s * rate)
     (radius, height), (other_radius, other_height) = reaches(row, tilt)[0], reaches(other, LEVEL)[0]
     drift_w = np.array([0.02, -0.03, 0.01])
-    for bearing in np.radians([75.0, 100.0, 120.0, 250.0]):
+    for bearing in np.radians([*range(60, 125, 5), 250]):
         place = Rotation.from_quat(tilt[[1, 2, 3, 0]]).apply([0.5 * math.cos(bearing), 0.5 * math.sin(bearing), 0.02])
         coming_w = -0.3 * place
         motion = np.r_[rotate_back(tilt, drift_w), rate]
@@ -278,11 +278,13 @@ def test_body_beside_the_sweep_of_a_row_is_not_in_its_way() -> None:
         assert math.isnan(times[8]) and math.isnan(times[1]) == (far_m > reach_m)
 
 
-def test_body_whose_turn_carries_its_modules_slowly_is_followed_straight_on() -> None:
-    one = dataclasses.replace(single(1), r_bm=np.array([[1.0, 0.0, 0.0]]))
-    exact_s = (2.0 - 1.0 - TOUCH_M) / 0.1
+@pytest.mark.parametrize("axis", [3, 5], ids=["roll", "yaw"])
+def test_body_whose_turn_carries_its_modules_slowly_is_followed_straight_on(axis: int) -> None:
+    arm, exact_s = np.eye(3)[int(axis == 3)], (2.0 - TOUCH_M) / 0.1
+    one = dataclasses.replace(single(1), r_bm=arm[None])
     for rate, straight in ((OWN_M_S, True), (1.01 * OWN_M_S, False)):
-        estimates = {1: at([0.0, 0.0, 1.0], [0.1, 0.0, 0.0], turn=rate), 8: at([2.0, 0.0, 1.0])}
+        turning = np.where(np.arange(6) == axis, rate, [0.1, 0.0, 0.0, 0.0, 0.0, 0.0])
+        estimates = {1: at(ZERO, nu=turning), 8: at(arm + np.array([2.0, 0.0, 0.0]))}
         time_s = times_of([one, single(8)], estimates, {1: STILL, 8: STILL}, math.inf)[1]
         assert (time_s == pytest.approx(exact_s, rel=1e-9)) == straight
 
