@@ -278,6 +278,13 @@ def test_body_beside_the_sweep_of_a_row_is_not_in_its_way() -> None:
         assert math.isnan(times[8]) and math.isnan(times[1]) == (far_m > reach_m)
 
 
+def test_body_within_the_sweep_by_three_hundredths_of_the_arm_is_in_the_way() -> None:
+    """Where straight pieces of an arc that are half as long again would pass beside it."""
+    row, other, bearing, far_m = row_of_three(), single(8), math.radians(16.875), 0.97 * PITCH_M + TOUCH_M
+    estimates = {1: at([0.0, 0.0, 1.0], turn=2.0), 8: at([far_m * math.cos(bearing), far_m * math.sin(bearing), 1.0])}
+    assert times_of([row, other], estimates, {1: STILL, 8: STILL}, math.inf)[1] < 0.5 * math.pi / 2.0
+
+
 @pytest.mark.parametrize("axis", [3, 5], ids=["roll", "yaw"])
 def test_body_whose_turn_carries_its_modules_slowly_is_followed_straight_on(axis: int) -> None:
     arm, exact_s = np.eye(3)[int(axis == 3)], (2.0 - TOUCH_M) / 0.1
