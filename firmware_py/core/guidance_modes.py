@@ -316,15 +316,22 @@ class Guidance:
         """Returns the wish, or rest where it leads to another body in too short a time; keeps the motion that was wanted."""
         if self.mode not in FREE or self._least_s == 0.0:
             return wish
-        at, most = self._glider.at, np.array([self._p.speed_m_s, self._p.rate_rad_s if wish.rate_rad_s is None else wish.rate_rad_s])
-        way = ZERO if wish.p_wb is None else np.nan_to_num(wish.p_wb - at.p_wb)
-        turn = ZERO if wish.q_wb is None else np.asarray(difference(wish.q_wb, at.q_wb))
-        length = np.array([np.linalg.norm(way), np.linalg.norm(turn)])
-        # least time to a pose, so that the fail-safe `collision` permits one just before another body
-        arrival_s = self._least_s + braking_s(np.minimum(most, length / self._least_s), self.deceleration, self._p.bandwidth)
-        move_s, turn_s = np.maximum(arrival_s, length / most)
-        self.wanted = np.r_[wish.v_w + way / move_s, wish.w_b + turn / turn_s]
+        self.wanted = np.concatenate((wish.v_w, wish.w_b))
+        if wish.p_wb is not None or wish.q_wb is not None:
+            self.wanted += self._motion_to(wish)
         return REST if health.collision_s < self._least_s else wish
+
+    def _motion_to(self, wish: Wish) -> np.ndarray:
+        """Returns the mean velocity, world, m/s, and turning rate, body, rad/s, (6,), of the way to the pose of a wish."""
+        at, p = self._glider.at, self._p
+        way = ZERO if wish.p_wb is None else np.where(np.isnan(wish.p_wb), 0.0, wish.p_wb - at.p_wb)
+        turn = ZERO if wish.q_wb is None else difference(wish.q_wb, at.q_wb)
+        way_m, turn_rad = math.hypot(*way.tolist()), math.hypot(*turn.tolist())
+        rate_rad_s = p.rate_rad_s if wish.rate_rad_s is None else wish.rate_rad_s
+        fastest = np.array([min(p.speed_m_s, way_m / self._least_s), min(rate_rad_s, turn_rad / self._least_s)])
+        # least time to a pose, so that the fail-safe `collision` permits one just before another body
+        arrival_s = self._least_s + float(braking_s(fastest, self.deceleration, p.bandwidth))
+        return np.concatenate((way / max(arrival_s, way_m / p.speed_m_s), turn / max(arrival_s, turn_rad / rate_rad_s)))
 
     def _guided(self, time_ns: int) -> Wish:
         """Returns the newest streamed set-point, extrapolated by its own speed; it stops after `guided_timeout_s` without a newer one."""
