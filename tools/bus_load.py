@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import deepcopy
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from command_line import Parser, refuse, run_tool
 
 import cantools.database
 
-from firmware_py.bus.codec import Codec
+from firmware_py.bus.codec import Codec, load_database
 from firmware_py.bus.load import MEAN_LIMIT, TICK_LIMIT, BusLoad, bus_load
 from firmware_py.description.fleet import load_fleet
 from firmware_py.description.schema import DescriptionError
@@ -36,8 +35,7 @@ def expanded_dbc(numbers: Sequence[int]) -> str:
     """
     if wrong := [number for number in numbers if not 1 <= number <= 29]:
         raise ValueError(f"number {wrong[0]} is not a module's; 1 to 29")
-    text = (resources.files("can_dbc") / "modcube.dbc").read_text(encoding="utf-8")
-    database = cantools.database.load_string(text, "dbc", frame_id_mask=0x7E0)
+    database = load_database()
     assert isinstance(database, cantools.database.can.Database)
     codec = Codec(database)
     messages: list[Any] = []

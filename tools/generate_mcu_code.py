@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from importlib import resources
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -22,7 +21,7 @@ from command_line import Parser, refuse, run_tool
 import cantools.database
 from cantools.database.can import c_source
 
-from firmware_py.bus.codec import Codec, Field, MessageCodec
+from firmware_py.bus.codec import Codec, Field, MessageCodec, load_database
 from firmware_py.bus.codec.crc import TABLE
 from firmware_py.bus.load import NUMBER_STEP, slow_schedule
 
@@ -32,8 +31,7 @@ NAME = "modcube"
 
 def generated_files() -> dict[str, str]:
     """The text of each file by its name."""
-    text = (resources.files("can_dbc") / "modcube.dbc").read_text(encoding="utf-8")
-    database = cantools.database.load_string(text, "dbc", frame_id_mask=0x7E0)
+    database = load_database()
     assert isinstance(database, cantools.database.can.Database)
     header, source, _, _ = c_source.generate(
         database, NAME, f"{NAME}.h", f"{NAME}.c", f"{NAME}_fuzzer.c", use_round=True

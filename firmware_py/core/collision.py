@@ -128,7 +128,8 @@ def within(excess, rate, speed2):  # type: ignore[no-untyped-def]
 @njit(f"void({M},{M},{M},{M},{M},int64[::1],boolean[:,::1],float64,float64,{V})", cache=True)
 def _meet(own_r, own_w, r_w, v_w, cylinder, of_body, ignored, begins_s, lasts_s, out):  # type: ignore[no-untyped-def]
     """Lowers `out`, (b,), to the least time to collision over all pairs of modules of two bodies, s, in a straight piece of their ways from
-    `begins_s` for `lasts_s`. Each body moves from `own_r` at `own_w`, while the others move from `r_w` at `v_w`: (m, 3) or more.
+    `begins_s` for `lasts_s`. Each body moves from `own_r` at `own_w`, while the others move from `r_w` at `v_w`: (m, 3), of
+    velocities the first three of more columns.
     """
     for i in range(of_body.size):
         for j in range(of_body.size):

@@ -247,7 +247,7 @@ class Guidance:
         if self.mode == Mode.AUTO and self._trajectory is not None and self._joined(self._trajectory, time_ns):
             sampled = self._sample(self._trajectory, time_ns)
             if sampled is not None:
-                self.wanted = np.r_[sampled[0].v_w, sampled[0].w_b]
+                self.wanted = np.concatenate((sampled[0].v_w, sampled[0].w_b))
                 return sampled
             self._trajectory = None  # it has a gap: the body stops before it
         if self.mode == Mode.DOCK and isinstance(self._docking, Setpoint):

@@ -9,12 +9,10 @@ import socket
 import subprocess
 from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
-from importlib import resources
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import cantools.database
 import numpy as np
 import pytest
 
@@ -36,7 +34,7 @@ from firmware_py.app.doctor import (
 from firmware_py.app.doctor_bus import WRONG, Seen, expected_of, judge, look_at
 from firmware_py.app.doctor_report import check_bus
 from firmware_py.app.service import reporting
-from firmware_py.bus.codec import Codec, Frame
+from firmware_py.bus.codec import Codec, Frame, load_database
 from firmware_py.bus.port import Port, open_port
 from firmware_py.core.types import Inputs, ModuleInputs, Outputs
 from firmware_py.runtime.clock import MonotonicClock
@@ -324,10 +322,9 @@ def test_units_are_what_systemd_understands(tmp_path: Path) -> None:
 
 def test_every_fault_that_a_module_can_report_of_a_part_has_words():
     """Regression: the status of a sensor that is added to the DBC was never told of."""
-    text = (resources.files("can_dbc") / "modcube.dbc").read_text(encoding="utf-8")
     reported = {
         (signal.name, value)
-        for message in cantools.database.load_string(text, "dbc", frame_id_mask=0x7E0).messages
+        for message in load_database().messages
         for signal in message.signals
         for value, choice in (signal.choices or {}).items()
         if "MODULE" in message.senders and message.name != "MCU_STATUS" and str(choice) == "FAULT"

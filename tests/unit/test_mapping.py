@@ -1,12 +1,10 @@
 """Frames from a module reach its own Inputs in each tick; and the effect of strangers on the bus."""
 
 import copy
-from importlib import resources
 
-import cantools.database
 import pytest
 
-from firmware_py.bus.codec import Codec, Frame
+from firmware_py.bus.codec import Codec, Frame, load_database
 from firmware_py.bus.mapping import InputCollector
 from firmware_py.core.types import MCU_ESTOP, Action, ModuleInputs, Request
 from tests.unit.bus_robot import CODEC, TWO_BUSES, Robot
@@ -188,8 +186,7 @@ def test_dropped_frames_of_all_buses_are_counted_from_the_start():
 
 def test_message_of_a_module_without_a_handler_is_refused_at_the_start():
     """Regression: a new message in the DBC that nothing takes was told as `somebody else commands modules`."""
-    text = (resources.files("can_dbc") / "modcube.dbc").read_text(encoding="utf-8")
-    database = cantools.database.load_string(text, "dbc", frame_id_mask=0x7E0)
+    database = load_database()
     InputCollector(TWO_BUSES, Codec(database))
     velocity = copy.deepcopy(next(message for message in database.messages if message.name == "GYRO"))
     velocity._name, velocity.frame_id = "VELOCITY", 0x160

@@ -4,7 +4,7 @@ The firmware and the simulated nodes use it at both ends of every frame. cantool
 """
 
 from firmware_py.bus.codec.crc import crc8
-from firmware_py.bus.codec.database import Codec
+from firmware_py.bus.codec.database import Codec, load_database
 from firmware_py.bus.codec.message import NO_COUNTER, CodecError, Field, Frame, MessageCodec
 from firmware_py.bus.codec.quaternion import pack_quaternion, unpack_quaternion
 from firmware_py.bus.codec.receiver import Received, Receiver
@@ -19,6 +19,7 @@ __all__ = [
     "Received",
     "Receiver",
     "crc8",
+    "load_database",
     "pack_quaternion",
     "unpack_quaternion",
 ]

@@ -10,6 +10,12 @@ import cantools.database
 from firmware_py.bus.codec.message import CodecError, MessageCodec
 
 
+def load_database() -> Any:
+    """Returns cantools' database of the DBC shipped with the package, in which ids are functions without node numbers."""
+    text = (resources.files("can_dbc") / "modcube.dbc").read_text(encoding="utf-8")
+    return cantools.database.load_string(text, "dbc", frame_id_mask=0x7E0)
+
+
 class Codec:
     """All messages of the DBC."""
 
@@ -23,8 +29,7 @@ class Codec:
     @classmethod
     def load(cls) -> Codec:
         """Loads the DBC shipped with the package (20 ms; load it once and pass it on)."""
-        text = (resources.files("can_dbc") / "modcube.dbc").read_text(encoding="utf-8")
-        return cls(cantools.database.load_string(text, "dbc", frame_id_mask=0x7E0))
+        return cls(load_database())
 
     def message(self, name: str) -> MessageCodec:
         """Returns the message called `name`. Raises KeyError, which lists the known names."""
