@@ -103,6 +103,10 @@ ROWS = (
     ),
     Row("e-stop on the bus", "stops, latched", _fault("estop", until_s=AT_S + 1.0), ends=_to("ESTOP", *MODES), within_s=0.02),
     Row(
+        "e-stop box silent", "holds the place after 5 s", _fault("estop_box_silent"), ends=_to("POSHOLD", *_all_but("SURFACE")),
+        within_s=5.2, error_m=0.030, says="e-stop box silent for",
+    ),
+    Row(
         "IMU frozen", "holds the place; 30 mm", _fault("imu_frozen"), ends=_to("POSHOLD", *_all_but("SURFACE")), within_s=1.0,
         error_m=0.030, says="no IMU for",
     ),

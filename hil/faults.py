@@ -19,15 +19,14 @@ from hil.nodes import Mcu, Nodes
 from hil.plant.camera import Sighting
 from hil.plant.docking import RELAY
 from hil.plant.draw import stream
-from hil.plant.fault_spec import ALL, DIRECTIONS, FACES, FRAME_KINDS, NS, THRUSTER_KINDS, Fault
+from hil.plant.fault_spec import ALL, DIRECTIONS, FACES, FRAME_KINDS, NO_BOX, NS, THRUSTER_KINDS, Fault
 
 NUMBER = 0x1F
 """Mask of the module number in a CAN id."""
 LOWEST_BABBLE_ID = 0x040
 """Lowest id of a babbling node, above ESTOP and SYNC, which have fault kinds of their own."""
-ESTOP, SYNC = Frame(0x01E, b""), Frame(0x020, bytes(4))
-"""Frames of the e-stop box, and of a second bus master."""
-ESTOP_PERIOD_NS = 50_000_000
+SYNC = Frame(0x020, bytes(4))
+"""Frame of a second bus master."""
 PUSH_LEVER_M = 0.03
 """Lever from the hull's centre to the point of an external push."""
 
@@ -119,12 +118,13 @@ class Faults:
             "jets": lambda fault, mcu: setattr(self._world, "jet_strength", fault.value),
             "push": self._push,
         }
-        self._intruders: dict[str, Callable[[int], list[Frame]]] = {
-            "estop": self._press_estop,
-            "foreign_sync": lambda time_ns: [SYNC],
-            "foreign_command": lambda time_ns: self._command_relays(),
+        self._intruders: dict[str, Callable[[], list[Frame]]] = {
+            "foreign_sync": lambda: [SYNC],
+            "foreign_command": self._command_relays,
         }
-        """Frames of each foreign node in a tick, in order of CAN id: the lower id wins arbitration."""
+        """Frames of each foreign node in a tick."""
+        self._box = {"estop": "pressed", "estop_box_silent": "silent"}
+        """Attribute of the e-stop box that is true during the fault."""
         self._misreads: dict[str, Callable[[Sighting, float], Sighting | None]] = {
             "tag_flip": lambda sighting, share: sighting._replace(q_wt=_flipped(sighting)) if self._tags.random() < share else sighting,
             "tag_jump": lambda sighting, north_m: sighting._replace(p_wt=sighting.p_wt + np.array([north_m, 0.0, 0.0])),
@@ -132,21 +132,23 @@ class Faults:
             "camera_bias": lambda sighting, off_m: sighting._replace(p_wt=sighting.p_wt + off_m * self._bias_axis),
         }
         """What cameras make of a sighting, by the value of the fault; None: lost."""
-        self._estop_due_ns = self._commands = 0
+        self._commands = 0
         self._dock_command = nodes.codec.message("DOCK_CMD")
         for camera in nodes.cameras:
             camera.change = self._change_tag
 
     @property
     def carried_out(self) -> set[str]:
-        """Kinds of fault that have an effect: in the plant, before the cameras, by foreign nodes, on the wire, or of the process."""
-        return {*self._breaks, *self._misreads, *self._intruders, *self._to_plant.kinds, "process_killed"}
+        """Kinds of fault that have an effect: in the plant, before the cameras, by other nodes, on the wire, or of the process."""
+        return {*self._breaks, *self._misreads, *self._intruders, *self._box, *self._to_plant.kinds, "process_killed"}
 
     def add(self, fault: Fault) -> None:
         """Adds a fault live. Raises DescriptionError for one that would have no effect."""
         thrusters = {number: len(self._world.vehicles[mcu.module].thruster) for number, mcu in self._nodes.mcus.items()}
         if not thrusters:
             raise DescriptionError(f"fault.kind: no MCU of the plant's own is there for {fault.kind}; C nodes have no faults")
+        if fault.kind == "estop_box_silent" and not self._nodes.box.beats:
+            raise DescriptionError(f"fault.kind: {NO_BOX}")
         for key, what in fault.mistakes(thrusters):
             raise DescriptionError(f"fault.{key}: {what}")
         self._faults.append(fault)
@@ -175,18 +177,13 @@ class Faults:
         """Returns the frames from the plant as they leave."""
         return self._from_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS and f.kind != "babble"], time_ns)
 
-    def intruders(self, time_ns: int) -> list[Frame]:
-        """Returns the frames of foreign nodes and the other nodes' answers to them."""
+    def unasked(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
+        """Returns `frames`, those of foreign nodes and the other nodes' answers to them. The lower CAN id wins arbitration."""
         kinds = {f.kind for f in self._on}
-        frames = [frame for kind, speak in self._intruders.items() if kind in kinds for frame in speak(time_ns)]
+        foreign = [frame for kind, speak in self._intruders.items() if kind in kinds for frame in speak()]
+        frames = sorted([*frames, *foreign], key=lambda frame: frame.id)
         frames += [answer for frame in frames for answer in self._nodes.take(frame, time_ns)]
         return self._from_plant.pass_on(frames, [f for f in self._on if f.kind in FRAME_KINDS], time_ns)
-
-    def _press_estop(self, time_ns: int) -> list[Frame]:
-        if time_ns < self._estop_due_ns:
-            return []
-        self._estop_due_ns = time_ns + ESTOP_PERIOD_NS
-        return [ESTOP]
 
     def _command_relays(self) -> list[Frame]:
         """Frames of a second controller that commands every relay off."""
@@ -204,6 +201,8 @@ class Faults:
         Of two faults on the same part the later in the list wins; sags, pushes and errors of a pressure add up.
         """
         self._world.jet_strength = self._world.spec.jet_strength
+        for kind, is_so in self._box.items():
+            setattr(self._nodes.box, is_so, any(fault.kind == kind for fault in self._on))
         for number, mcu in self._nodes.mcus.items():
             mcu.imu_frozen = mcu.leaks = mcu.readings_absent = False
             mcu.depth.repair()

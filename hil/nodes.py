@@ -29,6 +29,9 @@ PUSH_NS = 2_000_000_000
 OFF, REVERSE = 0, 2
 """Relay states."""
 VERSION = 1
+BOX_NUMBER, NODE_OK = 30, 1
+"""Number of the e-stop box, and NodeState OK of its HEARTBEAT."""
+ESTOP_PERIOD_NS = 50_000_000
 CABIN_PA = 101325.0
 CABIN_C = 30.0
 
@@ -206,8 +209,8 @@ class WireFaults(Protocol):
     def outgoing(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
         """Returns the frames from the plant as they leave."""
 
-    def intruders(self, time_ns: int) -> list[Frame]:
-        """Returns the frames that foreign nodes put on the wire, once per tick."""
+    def unasked(self, frames: Iterable[Frame], time_ns: int) -> list[Frame]:
+        """Returns the frames that leave once per tick without a SYNC: `frames`, and those of foreign nodes."""
 
 
 class NoFaults:
@@ -220,11 +223,33 @@ class NoFaults:
         """Returns all frames unchanged."""
         return list(frames)
 
-    outgoing = incoming
+    outgoing = unasked = incoming
 
-    def intruders(self, time_ns: int) -> list[Frame]:
-        """Returns no frames."""
-        return []
+
+class EstopBox:
+    """The e-stop box: says that it is there, and stops everyone while it is pressed."""
+
+    def __init__(self, codec: Codec, beats: bool) -> None:
+        """Creates a box that is not pressed; `beats`: it sends HEARTBEAT."""
+        heartbeat = codec.message("HEARTBEAT")
+        self._heartbeat = heartbeat.encode(BOX_NUMBER, (NODE_OK, VERSION))
+        self._estop = codec.message("ESTOP").encode(BOX_NUMBER)
+        self._beat_ns = heartbeat.cycle_ms * 1_000_000
+        self._beat_due_ns = self._estop_due_ns = 0
+        self.beats = beats
+        self.pressed = self.silent = False
+        """Whether it is raised; a fault: it sends nothing."""
+
+    def speak(self, time_ns: int) -> list[Frame]:
+        """Returns its frames that are due, the lower CAN id first."""
+        frames = []
+        if self.pressed and not self.silent and time_ns >= self._estop_due_ns:
+            self._estop_due_ns = time_ns + ESTOP_PERIOD_NS
+            frames.append(self._estop)
+        if self.beats and not self.silent and time_ns >= self._beat_due_ns:
+            self._beat_due_ns = time_ns + self._beat_ns
+            frames.append(self._heartbeat)
+        return frames
 
 
 class Nodes:
@@ -238,18 +263,21 @@ class Nodes:
         sensors: SensorSpec,
         cameras: Sequence[Camera] = (),
         tick_ns: int = 0,
+        box_beats: bool = False,
     ) -> None:
         """Creates all nodes at rest.
 
         Args:
             numbers: number on this bus -> index of the module in the world.
             tick_ns: period of SYNC; 0: the world's.
+            box_beats: whether the e-stop box sends HEARTBEAT.
         """
         self.world, self.codec = world, codec
         tick_ns = tick_ns or world.period_ns
         self.receiver = Receiver(codec)
         self.mcus = {number: Mcu(codec, number, module, world, sensors, tick_ns) for number, module in numbers.items()}
         self.cameras = [TagCamera(codec, cameras, numbers, sensors, world)] if cameras else []
+        self.box = EstopBox(codec, box_beats)
         self.faults: WireFaults = NoFaults()
         self._statuses = {codec.message("MCU_STATUS").id_of(number): number for number in numbers}
 
@@ -257,7 +285,11 @@ class Nodes:
         """Runs one tick of a world with this one bus: advances a period, takes the frames and returns the answers."""
         self.world.advance(self.world.period_ns)
         self.watch()
-        return self.answer(frames, self.world.time_ns) + self.faults.intruders(self.world.time_ns)
+        return self.answer(frames, self.world.time_ns) + self.speak(self.world.time_ns)
+
+    def speak(self, time_ns: int) -> list[Frame]:
+        """Returns what the e-stop box and foreign nodes send in a tick, with the other nodes' answers. Call once per tick."""
+        return self.faults.unasked(self.box.speak(time_ns), time_ns)
 
     def refuse_others(self, frames: Iterable[Frame], address: str, numbers: Container[int] | None = None) -> None:
         """Raises DescriptionError when a frame received at `address` is the MCU_STATUS of an MCU that is simulated here: one of `numbers`,
@@ -342,4 +374,4 @@ def make_nodes(world: World, codec: Codec, scenario: Scenario, tick_ns: int = 0)
         )
         for index, pose in enumerate(sorted(scenario.camera, key=lambda pose: pose.module > 0))  # carried cameras use the first one's phase
     ]
-    return Nodes(world, codec, numbers, scenario.sensors, cameras, tick_ns)
+    return Nodes(world, codec, numbers, scenario.sensors, cameras, tick_ns, scenario.estop_box)

@@ -103,7 +103,7 @@ class PlantProcess:
             self._guarded_ticks -= is_tick
             self._nodes.refuse_others([frame], port.address)
         answers = self._nodes.answer([frame], self._world.time_ns)
-        for answer in answers + self._nodes.faults.intruders(self._world.time_ns) if is_tick else answers:
+        for answer in answers + self._nodes.speak(self._world.time_ns) if is_tick else answers:
             port.send(answer)
         if self._truth is not None and is_tick:
             self._truth.record_world(int(self._sync.decode(frame.data)[0]), self._world)

@@ -204,6 +204,7 @@ class Scenario:
     camera: tuple[CameraPose, ...] = quantity(())
     polycube: Polycube | None = quantity(None)
     start: RandomStart = quantity(RandomStart())
+    estop_box: bool = quantity(False, help="whether an e-stop box sends its HEARTBEAT; false where a real one is on the same bus")
     dock: DockSpec = quantity(DockSpec())
     jam: JamRule = quantity(JamRule())
     step: tuple[Step, ...] = quantity(())

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from firmware_py.app.doctor import FAILED, OK, WARNING, Finding
 from firmware_py.bus.codec import Codec, Frame, Received, Receiver
 from firmware_py.bus.load import BIT_RATE, MEAN_LIMIT, bus_load, frame_bits, is_of_a_module
+from firmware_py.bus.mapping import ESTOP_BOX
 from firmware_py.bus.port import Port
 
 LISTEN_S = 0.3
@@ -28,6 +29,7 @@ WRONG: Mapping[str, Mapping[int, str]] = {
     "PowerStatus": {1: "a low supply", 2: "a critical supply", 15: "a dead supply sensor"},
     **{f"{name}Status": {2: f"a stale {name.lower()} sensor", 15: f"a dead {name.lower()} sensor"} for name in ("Gyro", "Accel", "Depth")},
     **{f"EscStatus{number}": {1: f"a fault of ESC {number}", 2: f"an ESC {number} that is too hot"} for number in range(1, 9)},
+    "NodeState": {0: "that it starts", 3: "a fault of its own"},
     **{f"RelayEcho{face}": {3: f"a fault of relay {face}"} for face in "ABCDEF"},
 }
 """Faults that a module reports, by field and value. A silent ESC is left out: an MCU reports that also of one that the vehicle lacks."""
@@ -119,6 +121,7 @@ def judge(title: str, seen: Seen, numbers: list[int], rate_hz: int, codec: Codec
     if seen.estop:
         who = ", ".join(str(number) for number in sorted(seen.estop))
         findings.append(Finding(title, WARNING, f"e-stop raised by number {who}", "release it where it was raised"))
+    findings += judge_box(title, seen)
     findings += judge_commands(title, seen)
     if seen.sync:
         findings.append(Finding(title, OK, "a controller runs on it: looked on, sent nothing"))
@@ -128,6 +131,14 @@ def judge(title: str, seen: Seen, numbers: list[int], rate_hz: int, codec: Codec
         text = ", ".join(f"{number} {kind}" for kind, number in seen.dropped.items())
         findings.append(Finding(title, WARNING, f"bad frames: {text}", "wiring, or a node with another DBC"))
     return [*findings, judge_load(title, seen, numbers, rate_hz, codec)]
+
+
+def judge_box(title: str, seen: Seen) -> Iterator[Finding]:
+    """Finding about the e-stop box, if there is one."""
+    if seen.wrong.get(ESTOP_BOX):
+        yield Finding(title, WARNING, f"the e-stop box reports {', '.join(seen.wrong[ESTOP_BOX])}", "see docs/mcu.md")
+    elif ESTOP_BOX in seen.messages:
+        yield Finding(title, OK, f"the e-stop box, number {ESTOP_BOX}, speaks")
 
 
 def judge_commands(title: str, seen: Seen) -> Iterator[Finding]:

@@ -21,6 +21,10 @@ REMEMBERED_TICKS = 256
 """CaptureTick has 8 bits."""
 OFFSET_SATURATED_MS = 25.5
 """Largest CaptureOffset: sent when the camera missed SYNCs, so the time of the picture is unknown."""
+ESTOP_BOX = 30
+"""Number of the e-stop box. Nodes with such a number send HEARTBEAT and ESTOP alone."""
+WORKING = (1, 2)
+"""NodeState OK and WARNING of a HEARTBEAT."""
 USABLE_STATUS = (0, 1)
 """Sensor status OK and SATURATED; a stale or failed sensor's values are not passed on."""
 SENSOR_FAULT = 15
@@ -52,7 +56,7 @@ class InputCollector:
         self._sync_ns: list[int | None] = [None] * REMEMBERED_TICKS
         self._halves: dict[tuple[int, float], tuple[Row, int]] = {}
         self._collections = 0
-        self._estop = self._foreign_sync = self._foreign_command = False
+        self._estop = self._foreign_sync = self._foreign_command = self._estop_box = False
         kinds = ("module", "tag_unpaired", "tag_stale", "tag_future", "sensor", "foreign_sync", "foreign_command")
         self.faults: dict[str, int] = dict.fromkeys(kinds, 0)
         self.without_status = set(range(len(fleet.module)))
@@ -88,7 +92,7 @@ class InputCollector:
                 continue
             handler = self._handlers[which]
             if handler is None:
-                self._take_other(self._names[which])
+                self._take_other(self._names[which], row)
                 continue
             index = self._index.get((bus, row[NUMBER]))
             if index is None:
@@ -117,8 +121,9 @@ class InputCollector:
         estop, self._estop = self._estop, False
         foreign_sync, self._foreign_sync = self._foreign_sync, False
         foreign_command, self._foreign_command = self._foreign_command, False
+        estop_box, self._estop_box = self._estop_box, False
         dropped = sum([receiver.dropped_in_all for receiver in self._receivers])
-        return Inputs(tick, time_ns, modules, list(requests), estop, dropped, foreign_sync, foreign_command)
+        return Inputs(tick, time_ns, modules, list(requests), estop, dropped, foreign_sync, foreign_command, estop_box)
 
     def _make_handlers(self) -> dict[str, Callable[[int, ModuleInputs, Row], None]]:
         handlers: dict[str, Callable[[int, ModuleInputs, Row], None]] = {
@@ -137,13 +142,16 @@ class InputCollector:
             handlers[f"ESC_FEEDBACK_{pair + 1}"] = _esc_handler(2 * pair)
         return handlers
 
-    def _take_other(self, name: str) -> None:
+    def _take_other(self, name: str, row: Row) -> None:
         if name == "ESTOP":
             self._estop = True
+            self._estop_box |= row[NUMBER] == ESTOP_BOX
+        elif name == "HEARTBEAT":
+            self._estop_box |= row[NUMBER] == ESTOP_BOX and row[VALUES] in WORKING
         elif name == "SYNC":
             self._foreign_sync = True
             self.faults["foreign_sync"] += 1
-        elif name != "HEARTBEAT":  # a HEARTBEAT only says that a node is there
+        else:
             self._foreign_command = True
             self.faults["foreign_command"] += 1
 

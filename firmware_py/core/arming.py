@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -43,6 +44,11 @@ def _estop(q: Question) -> str:
     if q.estop_age_ms < q.parameters.supervision.estop_quiet_ms:
         return "e-stop raised"
     return f"an e-stop holds module {', '.join(map(str, q.health.stopped))}" if q.health.stopped else ""
+
+
+def _estop_box(q: Question) -> str:
+    """Fails until an e-stop box that the robot should have is heard; its later silence is a fail-safe's."""
+    return "no e-stop box was heard" if q.parameters.supervision.estop_box and math.isnan(q.health.estop_box_age_s) else ""
 
 
 def _answers(q: Question) -> list[str]:
@@ -135,6 +141,7 @@ def _joints(q: Question) -> str:
 
 CHECKS = (
     Check("e-stop clear", _estop, False),
+    Check("e-stop box heard", _estop_box, True),
     Check("modules answer", _answers, False),
     Check("mode has what it needs", _needs, False),
     Check("sticks neutral", _sticks, False),

@@ -56,6 +56,7 @@ class _Latest:
     """When an attitude was last known."""
     foreign_sync_ns: int = NEVER_NS
     foreign_command_ns: int = NEVER_NS
+    estop_box_ns: int = NEVER_NS
     ground_ns: int = NEVER_NS
     pilot_ns: int = NEVER_NS
     stick: float = 0.0
@@ -151,6 +152,8 @@ class HealthMonitor:
             latest.foreign_sync_ns = now
         if inputs.foreign_command:
             latest.foreign_command_ns = now
+        if inputs.estop_box:
+            latest.estop_box_ns = now
         self._hear_operators(requests, now)
         self._rates(inputs, estimate, (now - latest.time_ns) * 1e-9)
         self._judge_tags(estimate, now)
@@ -204,6 +207,7 @@ class HealthMonitor:
             unready_s=(now - latest.ready_ns) * 1e-9,
             without_thrust=self._without_thrust,
             late=tuple([m for m in silent if now - self._reports.late_ns[m] <= self._answer_ns]),
+            estop_box_age_s=_age_s(latest.estop_box_ns, now),
         )
 
     def _listen(self, modules: Sequence[ModuleInputs], now: int) -> None:

@@ -205,6 +205,8 @@ class Inputs:
     """Another node's SYNC came since the previous tick."""
     foreign_command: bool = False
     """Another node's THRUSTER_CMD or DOCK_CMD came since the previous tick."""
+    estop_box: bool = False
+    """The e-stop box was heard since the previous tick."""
     prepared: list[Any] = field(default_factory=list)
     """Results of the worker: docking_decisions.Prepared."""
 

@@ -163,6 +163,14 @@ class Failsafes:
     module_silent_delay_s: float = delay(0.0, "FS_MOD_S")
     module_silent_action: int = action(2, "FS_MOD_ACT")
     module_silent_latched: int = latched(0, "FS_MOD_LAT")
+    # the e-stop box is unplugged or dead: nobody could stop the robot with it
+    estop_box_silent_limit: float = quantity(
+        5.0, unit="s", low=1, high=60,
+        help="longest permitted silence of the e-stop box, once it was heard; it sends HEARTBEAT at 2 Hz", mavlink="FS_EBOX_LIM"
+    )
+    estop_box_silent_delay_s: float = delay(0.0, "FS_EBOX_S")
+    estop_box_silent_action: int = action(2, "FS_EBOX_ACT")
+    estop_box_silent_latched: int = latched(0, "FS_EBOX_LAT")
     # the controller is late
     ticks_missed_limit: float = quantity(
         5.0, unit="1/s", low=1, high=400, help="largest permitted rate of missed ticks", mavlink="FS_TICK_LIM"

@@ -207,6 +207,9 @@ class Supervision:
         help="time without an e-stop frame after which an e-stop is over",
         mavlink="ESTOP_QUIET_MS",
     )
+    estop_box: int = quantity(
+        0, low=0, high=1, help="1: the robot has an e-stop box, and is not armed before it is heard", mavlink="ARM_ESTOP_BOX"
+    )
     rearm: int = quantity(
         0, low=0, high=1, help="after a restart in flight; 1: arm and hold at once, 0: wait to be armed", mavlink="REARM"
     )

@@ -16,6 +16,8 @@ ALL = -1
 FACES = len(FACE_NAMES)
 DIRECTIONS = ("to_plant", "from_plant", "both")
 NS = 1_000_000_000
+NO_BOX = "no e-stop box speaks here that could fall silent; give the scenario estop_box = true"
+"""Why the fault estop_box_silent is refused."""
 LARGEST = 1e6
 """Largest magnitude of a fault's value, in the unit of its kind."""
 
@@ -51,6 +53,7 @@ TAKES: Mapping[str, Takes] = {
     "frame_corrupt": FRAME_SHARE,
     "babble": Takes(1.0, LARGEST, whole=True, one_module=False, directions=("both", "from_plant")),
     "estop": OF_ALL,
+    "estop_box_silent": OF_ALL,
     "foreign_sync": OF_ALL,
     "foreign_command": OF_ALL,
     "imu_frozen": Takes(),

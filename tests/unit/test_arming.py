@@ -90,6 +90,13 @@ def test_e_stop_is_never_passed_over() -> None:
         assert reasons(GOOD._replace(stopped=(1,)), estop_age_ms=1e4, forced=forced) == ["an e-stop holds module 1"]
 
 
+def test_robot_that_has_an_e_stop_box_is_armed_once_the_box_was_heard() -> None:
+    boxed = replace(P, supervision=replace(P.supervision, estop_box=1))
+    assert reasons(GOOD, parameters=boxed) == ["no e-stop box was heard"]
+    assert reasons(GOOD, parameters=boxed, forced=True) == reasons(GOOD) == []
+    assert reasons(GOOD._replace(estop_box_age_s=4.0), parameters=boxed) == []
+
+
 def test_active_fail_safe_hinders_arming_and_force_passes_over_it() -> None:
     failsafes = Failsafes(replace(P.failsafes, leak_delay_s=0.0, cabin_hot_delay_s=0.0))
     wet = GOOD._replace(leak=True, cabin_c=75.0)
@@ -152,7 +159,7 @@ def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
         "e-stop clear", "modules answer", "mode has what it needs", "sticks neutral", "parameters valid", "compiled code warm",
     ]  # fmt: skip
     assert [check.name for check in CHECKS if check.may_be_skipped] == [
-        "pose fresh", "pose sure", "pose consistent", "battery and cabin known",
+        "e-stop box heard", "pose fresh", "pose sure", "pose consistent", "battery and cabin known",
         "modules fit", "every ESC answers", "no ESC without a thruster", "every axis has thrust", "no fail-safe on",
         "few bad frames", "topology as configured",
     ]  # fmt: skip

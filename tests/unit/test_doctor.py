@@ -194,6 +194,15 @@ def test_doctor_sends_nothing_where_a_controller_runs(far_end: Port) -> None:
     assert any("a controller runs on it" in finding.text for finding in judge("bus", seen, [], 100, CODEC))
 
 
+@pytest.mark.parametrize(("state", "judged", "says"), [
+    (1, OK, "the e-stop box, number 30, speaks"), (3, WARNING, "the e-stop box reports a fault of its own"),
+])  # fmt: skip
+def test_e_stop_box_is_told_of(state: int, judged: str, says: str, nodes: Nodes, far_end: Port) -> None:
+    beat = [CODEC.message("HEARTBEAT").encode(30, (state, 1))]
+    findings = list(check_bus(far_end.address, [1], 100, CODEC, lambda seconds: answer(nodes, far_end, beat)))
+    assert [finding.text for finding in findings if finding.state == judged and "e-stop" in finding.text] == [says]
+
+
 def test_raised_estop_and_bad_frames_are_told(nodes: Nodes, far_end: Port) -> None:
     bad = [Frame(0x01E, b""), Frame(0x101, bytes(8))]
     findings = list(check_bus(far_end.address, [1], 100, CODEC, lambda seconds: answer(nodes, far_end, bad)))

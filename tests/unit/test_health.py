@@ -319,6 +319,18 @@ def test_ground_station_and_pilot_count_once_they_were_heard() -> None:
     assert health.ground_age_s == health.pilot_age_s == pytest.approx(0.5) and health.stick == 0.4
 
 
+def test_e_stop_box_counts_once_it_was_heard_by_any_part_of_the_body() -> None:
+    bench, later = MonitorBench(), MonitorBench()
+    assert math.isnan(bench.wait(5.0).estop_box_age_s)
+    bench.foreign = {"estop_box": True}
+    assert bench.step().estop_box_age_s == 0.0
+    bench.foreign = {}
+    assert bench.wait(0.5).estop_box_age_s == pytest.approx(0.5)
+    later.monitor.take_over([MonitorBench().monitor, bench.monitor])
+    later.time_ns = bench.time_ns
+    assert later.step().estop_box_age_s == pytest.approx(0.51)
+
+
 def test_bad_frames_and_missed_ticks_are_rates() -> None:
     bench = MonitorBench()
     for _ in range(300):

@@ -174,6 +174,23 @@ def test_heartbeat_of_another_node_is_no_command():
     assert not robot.tick(0).foreign_command and not robot.faults
 
 
+@pytest.mark.parametrize(("name", "number", "values", "is_heard"), [
+    ("HEARTBEAT", 30, (0, 7), False), ("HEARTBEAT", 30, (1, 7), True), ("HEARTBEAT", 30, (2, 7), True), ("HEARTBEAT", 30, (3, 7), False),
+    ("HEARTBEAT", 31, (1, 7), False), ("ESTOP", 30, (), True), ("ESTOP", 29, (), False), ("SYNC", 0, (5,), False),
+])  # fmt: skip
+def test_e_stop_box_is_heard_in_the_tick_in_which_it_speaks_and_says_that_it_works(name, number, values, is_heard):
+    robot = Robot(TWO_BUSES)
+    robot.say(name, values, number=number, bus=1)
+    assert [robot.tick(tick).estop_box for tick in (0, 1)] == [is_heard, False]
+
+
+def test_box_that_reports_a_fault_does_not_hide_that_it_worked_earlier_in_the_tick():
+    robot = Robot()
+    for state in (1, 3):
+        robot.say("HEARTBEAT", (state, 7), number=30)
+    assert robot.tick(0).estop_box
+
+
 def test_dropped_frames_of_all_buses_are_counted_from_the_start():
     robot = Robot(TWO_BUSES)
     gyro = CODEC.message("GYRO").encode(1, (0.0, 0.0, 0.0, 0), 3)

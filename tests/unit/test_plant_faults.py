@@ -403,6 +403,18 @@ def test_estop_box_sends_at_20_hz_while_it_is_raised() -> None:
     assert nodes.mcus[1].stopped
 
 
+def test_estop_box_says_twice_a_second_that_it_is_there_until_it_falls_silent() -> None:
+    nodes = nodes_with(Fault(kind="estop_box_silent", at_s=1.2, until_s=1.9), scenario="faults")
+    ticks = [tick for tick in range(1, 301) if any(frame.id == 0x71E for frame in fly(nodes, 1, first=tick))]
+    assert ticks == [1, 51, 101, 190, 240, 290]
+    assert not any(frame.id == 0x71E for frame in fly(nodes_with(), 100))
+
+
+def test_dead_estop_box_stops_nobody() -> None:
+    nodes = nodes_with(Fault(kind="estop"), Fault(kind="estop_box_silent"), scenario="faults")
+    assert not any(frame.id in (0x01E, 0x71E) for frame in fly(nodes, 100)) and not nodes.mcus[1].stopped
+
+
 def test_every_node_answers_a_foreign_sync_too() -> None:
     frames = fly(nodes_with(Fault(kind="foreign_sync")), 20, first=100)
     assert sum(frame.id == 0x020 for frame in frames) == 20
@@ -459,6 +471,13 @@ def test_live_fault_that_would_do_nothing_is_refused(fault: Fault, refusal: str)
     faults = Faults(nodes_with())
     with pytest.raises(DescriptionError, match=refusal):
         faults.add(fault)
+
+
+def test_box_that_never_speaks_cannot_fall_silent() -> None:
+    silent = Fault(kind="estop_box_silent")
+    with pytest.raises(DescriptionError, match=r"fault\.kind: no e-stop box speaks here"):
+        Faults(nodes_with()).add(silent)
+    Faults(nodes_with(scenario="faults")).add(silent)
 
 
 def test_thruster_is_one_that_a_module_of_the_fault_has() -> None:

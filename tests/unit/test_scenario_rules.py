@@ -32,7 +32,7 @@ from tests.unit.tanks import FaultyTank
 
 FOLDER = Path(load_scenario.__code__.co_filename).parent / "scenarios"
 Load = Callable[..., Scenario]
-WHOLE_BUS = ("estop", "foreign_sync", "foreign_command", "process_killed")
+WHOLE_BUS = ("estop", "estop_box_silent", "foreign_sync", "foreign_command", "process_killed")
 """Kinds of faults that concern no single module."""
 DOCK_STEP = '[[step]]\ndo = "dock"\nmodule = 2\nface = "-x"\ntarget_module = 1\ntarget_face = "+x"\n'
 WAIT_STEP = '[[step]]\ndo = "wait"\n'
@@ -113,6 +113,7 @@ def load(tmp_path: Path) -> Load:
         ("dock", DOCK_STEP, WAIT_STEP, "check[0].metric: docked says whether docks and undocks succeeded, and no [[step]] is one; "),
         ("dock-near-miss", "false_declarations", "outcome", "check[0].metric: outcome says whether docks and undocks succeeded, and no"),
         ("force-tracking", "force_difference_off", "force_rmse_three_on_n", "a run of the kind force has position_rmse_m, "),
+        ("hover", "", '[[fault]]\nkind = "estop_box_silent"', "fault[0].kind: no e-stop box speaks here that could fall silent; give the"),
         ("hover", "low = 0.7\nhigh = 1.4", "low = 1.4\nhigh = 0.7", "check[3].low: 1.4 is above high, 0.7"),
         ("hover", "high = 0.005", "high = -0.05", "check[0].high: -0.05, and position_rmse_m is 0 or more; no value would pass"),
         ("hover", "low = 0.97", "low = 97.0", "low: 97, and sigma3_share is 1 or less; no value would pass"),
