@@ -195,7 +195,8 @@ class Operated(NamedTuple):
 def fly_with_random_operator(seed: int, duration_s: float) -> Operated:
     """Flies for `duration_s` with faults and requests drawn from `seed`. The firmware's exceptions propagate."""
     rng, base = stream(seed, "operator"), load_scenario(SCENARIOS[seed % len(SCENARIOS)])
-    scenario = dataclasses.replace(base, fault=tuple(_fault(rng, duration_s) for _ in range(rng.integers(MOST_FAULTS + 1))))
+    faults = tuple(_fault(rng, duration_s) for _ in range(rng.integers(MOST_FAULTS + 1)))
+    scenario = dataclasses.replace(base, estop_box=True, fault=faults)
     operated = Operated(Counter(), Counter(), round(100 * duration_s))
     operator = RandomOperator(rng, len(scenario.module), operated.ticks)
     with ExitStack() as stack:

@@ -224,8 +224,8 @@ def fly_to_estop(seed: int) -> StoppedFlight:
     return StoppedFlight(ticks, violations, was_armed)
 
 
-OWN_FIGURES = ("process_killed", "estop")
-"""Faults that cannot be combined with an e-stop: the first ends the firmware, the second is an e-stop itself."""
+OWN_FIGURES = ("process_killed", "estop", "estop_box_silent")
+"""Faults that cannot be combined with an e-stop: the first ends the firmware, the second is one itself, and the third prevents it."""
 
 
 class _Nagging:
