@@ -41,7 +41,7 @@ WATCHED = """\
   turns, or wants to. Both must have seen tags, and near each other by more than 8 cm/s, 4 cm/s of it by the body's own motion. A body
   without tags keeps others 5 cm farther off for each second, up to 1 m. The two bodies of a dock do not count for each other, nor do the
   two pieces of an undock for three seconds. In DOCK a body waits for others by itself.
-- `estop_box_silent`: a box that was heard since the start of the process (HEARTBEAT with NodeState OK or WARNING, or ESTOP). With
+- `estop_box_silent`: a box that was heard since the start of the process (HEARTBEAT with NodeState OK or WARNING). With
   `ARM_ESTOP_BOX` 1 a robot whose box was not heard yet is not armed either; forced arming skips this.
 - `ground_lost`: the ground station that is watched ([ground-station.md](ground-station.md#connect))."""
 AFTERWARDS = """\

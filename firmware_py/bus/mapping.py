@@ -145,7 +145,6 @@ class InputCollector:
     def _take_other(self, name: str, row: Row) -> None:
         if name == "ESTOP":
             self._estop = True
-            self._estop_box |= row[NUMBER] == ESTOP_BOX
         elif name == "HEARTBEAT":
             self._estop_box |= row[NUMBER] == ESTOP_BOX and row[VALUES] in WORKING
         elif name == "SYNC":
