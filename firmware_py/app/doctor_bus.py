@@ -32,7 +32,7 @@ WRONG: Mapping[str, Mapping[int, str]] = {
     "NodeState": {0: "that it starts", 3: "a fault of its own"},
     **{f"RelayEcho{face}": {3: f"a fault of relay {face}"} for face in "ABCDEF"},
 }
-"""Faults that a module reports, by field and value. A silent ESC is left out: an MCU reports that also of one that the vehicle lacks."""
+"""Faults that a node reports, by field and value. A silent ESC is left out: an MCU reports that also of one that the vehicle lacks."""
 
 
 @dataclass(slots=True)
@@ -49,7 +49,7 @@ class Seen:
     status: dict[int, tuple[int, int, int]] = field(default_factory=dict)
     """By module: version, errors, state."""
     wrong: dict[int, dict[str, None]] = field(default_factory=dict)
-    """By module: faults that its frames reported, each once, in order."""
+    """By number: faults that its frames reported, each once, in order."""
     messages: dict[int, set[str]] = field(default_factory=dict)
     """By number: names of the messages received."""
     dropped: dict[str, int] = field(default_factory=dict)
@@ -134,10 +134,10 @@ def judge(title: str, seen: Seen, numbers: list[int], rate_hz: int, codec: Codec
 
 
 def judge_box(title: str, seen: Seen) -> Iterator[Finding]:
-    """Finding about the e-stop box, if there is one."""
+    """Finding about the e-stop box, if one says that it is there; `judge` tells of one that only stops."""
     if seen.wrong.get(ESTOP_BOX):
         yield Finding(title, WARNING, f"the e-stop box reports {', '.join(seen.wrong[ESTOP_BOX])}", "see docs/mcu.md")
-    elif ESTOP_BOX in seen.messages:
+    elif "HEARTBEAT" in seen.messages.get(ESTOP_BOX, ()):
         yield Finding(title, OK, f"the e-stop box, number {ESTOP_BOX}, speaks")
 
 

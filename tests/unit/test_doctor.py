@@ -195,12 +195,20 @@ def test_doctor_sends_nothing_where_a_controller_runs(far_end: Port) -> None:
 
 
 @pytest.mark.parametrize(("state", "judged", "says"), [
-    (1, OK, "the e-stop box, number 30, speaks"), (3, WARNING, "the e-stop box reports a fault of its own"),
+    (0, WARNING, "the e-stop box reports that it starts"), (1, OK, "the e-stop box, number 30, speaks"),
+    (3, WARNING, "the e-stop box reports a fault of its own"),
 ])  # fmt: skip
 def test_e_stop_box_is_told_of(state: int, judged: str, says: str, nodes: Nodes, far_end: Port) -> None:
     beat = [CODEC.message("HEARTBEAT").encode(30, (state, 1))]
     findings = list(check_bus(far_end.address, [1], 100, CODEC, lambda seconds: answer(nodes, far_end, beat)))
     assert [finding.text for finding in findings if finding.state == judged and "e-stop" in finding.text] == [says]
+
+
+@pytest.mark.parametrize("spoken", [[], [Frame(0x01E, b"")]])
+def test_e_stop_box_without_heartbeat_is_not_told_to_be_there(spoken: list[Frame], nodes: Nodes, far_end: Port) -> None:
+    """Regression: a box that only stops was said to be fine, while the firmware that should have a box would not be armed."""
+    findings = check_bus(far_end.address, [1], 100, CODEC, lambda seconds: answer(nodes, far_end, spoken))
+    assert not any("the e-stop box" in finding.text for finding in findings)
 
 
 def test_raised_estop_and_bad_frames_are_told(nodes: Nodes, far_end: Port) -> None:
