@@ -329,6 +329,8 @@ def test_e_stop_box_counts_once_it_was_heard_by_any_part_of_the_body() -> None:
     later.monitor.take_over([MonitorBench().monitor, bench.monitor])
     later.time_ns = bench.time_ns
     assert later.step().estop_box_age_s == pytest.approx(0.51)
+    bench.foreign = {"estop_box": True}
+    assert bench.step().estop_box_age_s == 0.0, "whenever it speaks"
 
 
 def test_bad_frames_and_missed_ticks_are_rates() -> None:

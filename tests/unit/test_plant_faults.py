@@ -405,9 +405,17 @@ def test_estop_box_sends_at_20_hz_while_it_is_raised() -> None:
 
 def test_estop_box_says_twice_a_second_that_it_is_there_until_it_falls_silent() -> None:
     nodes = nodes_with(Fault(kind="estop_box_silent", at_s=1.2, until_s=1.9), scenario="faults")
-    ticks = [tick for tick in range(1, 301) if any(frame.id == 0x71E for frame in fly(nodes, 1, first=tick))]
+    works = CODEC.message("HEARTBEAT").encode(30, (1, 1))
+    ticks = [tick for tick in range(1, 301) if works in fly(nodes, 1, first=tick)]
     assert ticks == [1, 51, 101, 190, 240, 290]
     assert not any(frame.id == 0x71E for frame in fly(nodes_with(), 100))
+
+
+def test_frames_of_the_estop_box_wait_for_lower_ids_and_are_lost_as_others_are() -> None:
+    faults = Fault(kind="estop"), Fault(kind="foreign_sync")
+    ids = [frame.id for frame in fly(nodes_with(*faults, scenario="faults"), 1) if frame.id in (0x01E, 0x020, 0x71E)]
+    assert ids == [0x01E, 0x020, 0x71E]
+    assert not fly(nodes_with(*faults, Fault(kind="frame_loss", value=1.0), scenario="faults"), 100)
 
 
 def test_dead_estop_box_stops_nobody() -> None:
