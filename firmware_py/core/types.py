@@ -206,7 +206,7 @@ class Inputs:
     foreign_command: bool = False
     """Another node's THRUSTER_CMD or DOCK_CMD came since the previous tick."""
     estop_box: bool = False
-    """The e-stop box was heard since the previous tick."""
+    """A HEARTBEAT of an e-stop box that works came since the previous tick."""
     prepared: list[Any] = field(default_factory=list)
     """Results of the worker: docking_decisions.Prepared."""
 
