@@ -31,9 +31,9 @@ NEAR_M, NEAR_RAD = 0.2, 0.35
 """Largest distance, in m and rad, between set-point and body at which the set-point continues from where it is; otherwise it restarts from
 the body."""
 LEAST_LIFT = 0.5
-"""Share of `surface_force_n` with which SURFACE lifts a body that believes to be at the surface: a depth sensor that reads too shallow
-must not keep a robot down. 1.5 N is three times the buoyancy that a module may lack on the bench, and lifts the hull 3 mm farther out of
-the water."""
+"""Share of `surface_n_per_kg` with which SURFACE lifts a body that believes to be at the surface: a depth sensor that reads too shallow
+must not keep a robot down. The 1.55 N of a module are three times the buoyancy that it may lack on the bench, and lift its hull 3 mm
+farther out of the water."""
 SURFACE_MARGIN_M = 0.02
 """Depth below that of the surface at which the body counts as there."""
 COME_M = 0.005
@@ -115,7 +115,7 @@ class Guidance:
         self._most_push_m_s = f.pushed_limit if f.pushed_action > Level.WARN else math.inf
         self._least_s = f.collision_limit if f.collision_action >= Level.HOLD else 0.0
         self._full_stick = p.stick_share * self._body.thrusters.full_wrench
-        self._lift_n = p.surface_force_n * len(self._body.modules)
+        self._lift_n = p.surface_n_per_kg * float(self._body.mass[2, 2])
         depth_m = self._body.r_bm[:, 2]
         at_surface_m = p.surface_depth_m + float(depth_m.mean() - depth_m.min())  # the highest module is to be at the surface
         self._surface_m = max(at_surface_m, float((0.5 * self._body.hull_m[:, 2] - depth_m).max()))  # with its hull in the water

@@ -60,9 +60,10 @@ class Steering:
         0.12, unit="m", low=0, high=10,
         help="depth of the (highest docked) module's centre of mass at the surface; a taller hull stays in the water", mavlink="SURF_DEPTH"
     )
-    surface_force_n: float = quantity(
-        3.0, unit="N", low=0, high=1000,
-        help="upward force per module in SURFACE while depth is unknown; at the surface at least half of it", mavlink="SURF_FORCE"
+    surface_n_per_kg: float = quantity(
+        0.2, unit="N/kg", low=0, high=10,
+        help="upward force in SURFACE while depth is unknown, per kg that moves: hull, entrained and added mass; at the surface at least "
+        "half of it", mavlink="SURF_LIFT"
     )
     blend_s: float = quantity(
         0.3, unit="s", low=0, high=5, help="time over which the wrench is blended into that of a new mode", mavlink="MODE_BLEND"

@@ -15,6 +15,9 @@ from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from tests.unit.guidance_flight import LEVEL, WRENCH, ZERO, Flight, estimate
 from tests.unit.healths import BLIND, GOOD, UPRIGHT
 
+LIFT_N = Parameters().steering.surface_n_per_kg * 15.5
+"""Of a module: 9.3 kg of robot and entrained water, 6.2 kg of added mass."""
+
 
 def test_surfacing_robot_rises_levels_and_stays_up() -> None:
     flight = Flight()
@@ -28,7 +31,7 @@ def test_surfacing_robot_rises_levels_and_stays_up() -> None:
 
 
 def test_surfacing_robot_lifts_blindly_when_it_must() -> None:
-    lift = -Parameters().steering.surface_force_n
+    lift = -LIFT_N
     for health, expected in (
         (BLIND, [0.0, 0.0, lift, 0.0, 0.0, 0.0]),
         (GOOD._replace(tag_age_s=9.0, depth_age_s=9.0), [0.0, 0.0, lift, *WRENCH[3:]]),
@@ -43,6 +46,16 @@ def test_surfacing_robot_lifts_blindly_when_it_must() -> None:
         np.testing.assert_allclose(flight.wrenches[-1], expected, atol=1e-12)
 
 
+@pytest.mark.parametrize(("vehicle", "modules"), [("modcube", 1), ("modcube", 2), ("girona500", 1)])
+def test_blind_lift_grows_with_what_it_has_to_move(vehicle: str, modules: int) -> None:
+    """Regression: it was 3 N for any vehicle, and a robot of 740 kg that weighed 5 N sank."""
+    body = assemble([(i, 0, 0) for i in range(modules)], [0] * modules, [load_vehicle(vehicle)] * modules, list(range(modules)))
+    flight = Flight(body=body)
+    flight.do(Effect.ENTER_MODE, Mode.SURFACE)
+    flight.run(0.5, health=BLIND)
+    np.testing.assert_allclose(flight.wrenches[-1], [0.0, 0.0, -0.2 * body.mass[2, 2], 0.0, 0.0, 0.0], atol=1e-12)
+
+
 @pytest.mark.parametrize("depth_m", [0.13, 0.0, -10.0])
 def test_robot_that_believes_to_be_at_the_surface_is_lifted_all_the_same(depth_m: float) -> None:
     """A pressure sensor that read too shallow kept a robot with a leak under water. The controller would push down with 3 N here."""
@@ -51,7 +64,7 @@ def test_robot_that_believes_to_be_at_the_surface_is_lifted_all_the_same(depth_m
     flight.do(Effect.ENTER_MODE, Mode.SURFACE)
     flight.run(5.0, health=GOOD._replace(tag_age_s=9.0), follows=False)
     lift_w = rotate(flight.estimate.q_wb, flight.wrenches[-1][:3].copy())
-    np.testing.assert_allclose(lift_w, [0.0, 0.0, -0.5 * Parameters().steering.surface_force_n], atol=1e-12)
+    np.testing.assert_allclose(lift_w, [0.0, 0.0, -0.5 * LIFT_N], atol=1e-12)
 
 
 def test_stacked_robot_stays_with_its_highest_module_at_the_surface() -> None:
@@ -60,7 +73,7 @@ def test_stacked_robot_stays_with_its_highest_module_at_the_surface() -> None:
     flight = Flight(body=stack)
     flight.do(Effect.ENTER_MODE, Mode.SURFACE)
     assert flight.run(40.0).p_wb[2] == pytest.approx(Parameters().steering.surface_depth_m + 0.21, abs=1e-3)
-    assert rotate(flight.estimate.q_wb, flight.wrenches[-1][:3].copy())[2] == pytest.approx(-4.5), "1.5 N for each module"
+    assert rotate(flight.estimate.q_wb, flight.wrenches[-1][:3].copy())[2] == pytest.approx(-0.5 * LIFT_N * 3)
 
 
 @pytest.mark.parametrize(("name", "depth_m"), [("modcube", 0.12), ("bluerov2", 0.127), ("girona500", 0.5)])
