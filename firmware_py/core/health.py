@@ -95,6 +95,8 @@ class Health(NamedTuple):
     """Axes that no thruster of the body can push although the vehicle does not declare them passive."""
     late: tuple[int, ...] = ()
     """Those of `silent` from which an MCU_STATUS came lately, but of another tick than the one in which it came."""
+    still_s: float = 0.0
+    """How long no module has obeyed commands, so that all thrusters stand still."""
     estop_box_age_s: float = math.nan
     """NaN before an e-stop box was heard."""
 

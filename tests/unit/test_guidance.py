@@ -12,6 +12,7 @@ from firmware_py.core.transitions import Effect
 from firmware_py.core.types import Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
 from tests.unit.guidance_flight import FLOWN, LEVEL, WRENCH, ZERO, Flight, Ramp, estimate, sticks
+from tests.unit.healths import GOOD
 
 
 @pytest.mark.parametrize("modes", list(itertools.product(FLOWN, FLOWN)), ids=lambda pair: "-".join(m.name for m in pair))
@@ -151,6 +152,28 @@ def test_loop_that_stood_still_goes_on_from_the_body_and_not_from_where_it_would
     assert np.linalg.norm(after.p_wb - before.p_wb) < 0.01
     later = flight.run(1.0)
     assert 0.01 < np.linalg.norm(later.p_wb - after.p_wb) < 0.4, "it goes on"
+
+
+def test_set_point_stays_with_a_body_whose_modules_obey_nothing() -> None:
+    """Regression: a microcontroller that came back after 20 s swam at 0.64 m/s to where its module had been 3 m before."""
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.POSHOLD)
+    before = flight.run(1.0)
+    flight.estimate = estimate((2.0, 1.0, 1.0))
+    held = flight.run(1.0, health=GOOD._replace(still_s=0.1), follows=False)
+    assert np.linalg.norm(held.p_wb[:2] - before.p_wb[:2]) < 1e-9, "their commands may only have been late"
+    flight.run(1.0, health=GOOD._replace(still_s=0.11), follows=False)
+    assert np.linalg.norm(flight.run(1.0, follows=False).p_wb[:2] - [2.0, 1.0]) < 1e-9
+
+
+def test_path_waits_while_no_module_obeys() -> None:
+    flight = Flight()
+    flight.do(Effect.ENTER_MODE, Mode.AUTO)
+    flight.do(Effect.FOLLOW, Mode.AUTO, Ramp())
+    before = flight.run(1.0)
+    during, after = flight.run(5.0, health=GOOD._replace(still_s=0.3)), flight.run(1.0)
+    np.testing.assert_allclose(during.p_wb, before.p_wb, atol=1e-9)
+    assert 0.01 < np.linalg.norm(after.p_wb - before.p_wb) < 0.4, "it goes on"
 
 
 def test_set_point_that_is_no_number_is_not_gone_on_from() -> None:

@@ -138,6 +138,9 @@ def test_module_that_says_that_it_obeys_no_commands_counts_as_silent(state: int)
     deaf_s = [bench.step(here(mcu_state=state), here(mcu_state=2)).silent_s, bench.step(here(), here(mcu_state=2)).silent_s]
     assert 0.0 < deaf_s[0] < deaf_s[1], "frames without a status are as the status before"
     assert bench.monitor.now.bus_silent_s == 0.0 and bench.monitor.now.silent == (), "it answers"
+    assert bench.monitor.now.still_s == 0.0, "the other one obeys"
+    still_s = [bench.step(here(), here(mcu_state=state)).still_s for _ in range(2)]
+    assert still_s == pytest.approx([0.01, 0.02])
     whole = MonitorBench()
     whole.time_ns = bench.time_ns
     whole.monitor.take_over([bench.monitor])
