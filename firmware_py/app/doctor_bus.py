@@ -11,8 +11,8 @@ from firmware_py.bus.load import BIT_RATE, MEAN_LIMIT, bus_load, frame_bits, is_
 from firmware_py.bus.mapping import ESTOP_BOX
 from firmware_py.bus.port import Port
 
-LISTEN_S = 0.3
-"""Listening time. A foreign SYNC (at least 50 Hz) appears within a fraction of it."""
+LISTEN_S = 0.6
+"""Listening time. A HEARTBEAT (2 Hz) comes once in it, a foreign SYNC (at least 50 Hz) within a fraction of it."""
 TICK_S = 0.01
 TICKS = 60
 """Number of SYNCs sent: every slow message of a module but HEARTBEAT comes at least once in 200 ms."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import re
 import shutil
@@ -202,6 +203,20 @@ def test_e_stop_box_is_told_of(state: int, judged: str, says: str, nodes: Nodes,
     beat = [CODEC.message("HEARTBEAT").encode(30, (state, 1))]
     findings = list(check_bus(far_end.address, [1], 100, CODEC, lambda seconds: answer(nodes, far_end, beat)))
     assert [finding.text for finding in findings if finding.state == judged and "e-stop" in finding.text] == [says]
+
+
+def test_fault_of_an_e_stop_box_is_told_of_where_a_controller_runs(far_end: Port) -> None:
+    """Regression: the doctor looked on for 0.3 s there, and a HEARTBEAT comes every half second."""
+    sync, beat, waits = CODEC.message("SYNC").encode(0, (1,)), CODEC.message("HEARTBEAT").encode(30, (3, 1)), itertools.count()
+
+    def speak(seconds: float) -> None:
+        far_end.send(sync)
+        if next(waits) % 50 == 49:
+            far_end.send(beat)
+
+    with open_port(far_end.address) as port:
+        seen = look_at(port, CODEC, speak)
+    assert any("the e-stop box reports a fault of its own" in finding.text for finding in judge("bus", seen, [], 100, CODEC))
 
 
 @pytest.mark.parametrize("spoken", [[], [Frame(0x01E, b"")]])
