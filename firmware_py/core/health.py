@@ -96,7 +96,7 @@ class Health(NamedTuple):
     late: tuple[int, ...] = ()
     """Those of `silent` from which an MCU_STATUS came lately, but of another tick than the one in which it came."""
     still_s: float = 0.0
-    """How long no module has obeyed commands, so that all thrusters stand still."""
+    """How long every module has reported that it obeys no commands, so that all thrusters stand still. One that is only silent may obey."""
     estop_box_age_s: float = math.nan
     """NaN before an e-stop box was heard."""
 

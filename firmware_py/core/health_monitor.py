@@ -207,7 +207,7 @@ class HealthMonitor:
             unready_s=(now - latest.ready_ns) * 1e-9,
             without_thrust=self._without_thrust,
             late=tuple([m for m in silent if now - self._reports.late_ns[m] <= self._answer_ns]),
-            still_s=(now - max(self._reports.hears_ns.values())) * 1e-9,
+            still_s=min(at - self._reports.hears_ns[m] for m, at in self._reports.heard_ns.items()) * 1e-9,
             estop_box_age_s=_age_s(latest.estop_box_ns, now),
         )
 

@@ -16,6 +16,7 @@ from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import exp
 from firmware_py.core.thruster_names import Place
 from firmware_py.core.types import (
+    MCU_TIMED_OUT,
     MCU_UNFIT,
     Action,
     BodyPose,
@@ -146,6 +147,17 @@ def test_module_that_says_that_it_obeys_no_commands_counts_as_silent(state: int)
     whole.monitor.take_over([bench.monitor])
     assert whole.step(here(), here()).silent_s > deaf_s[1]
     assert bench.step(here(mcu_state=2), here(mcu_state=2)).silent_s == 0.0
+
+
+def test_body_that_falls_silent_is_not_said_to_obey_nothing() -> None:
+    """Regression: it heard its commands, and swam on at 0.8 m/s after a fail-safe because its set-point went along."""
+    bench = MonitorBench()
+    bench.step(here(mcu_state=2), here(mcu_state=2))
+    for _ in range(30):
+        health = bench.step()
+    assert health.silent_s == pytest.approx(0.3) and health.still_s == 0.0
+    assert bench.step(here(mcu_state=MCU_TIMED_OUT)).still_s == 0.0, "the other one may obey"
+    assert bench.step(here(), here(mcu_state=MCU_TIMED_OUT)).still_s > 0.3
 
 
 def test_module_that_only_talks_has_not_answered() -> None:
