@@ -32,7 +32,7 @@ that mode, and where it "only warns" its action does not apply. While a fail-saf
 (forced arming skips this)."""
 WATCHED = """\
 - `module_silent`: no frame of a module comes, or it reports that it obeys no commands (BOOT, TIMEOUT or FAULT in MCU_STATUS).
-  While every module of a body reports so, its path waits and its set-point stays where the body is: it does not swim back by itself
+  While every module of a body reports so, its path waits and its set-point rests where the body is: it does not swim back by itself
   afterwards.
 - `thruster_lost`: a thruster is left out because its ESC failed, or because it stands still, does not obey, or does not push as it says
   (`faults.*`). It is used again once the body is disarmed, its failed ESC has been well for a second, or the robot is pushed as much

@@ -25,8 +25,8 @@ from firmware_py.description.parameters import Parameters
 
 ZERO, STILL, DOWN = np.zeros(3), np.zeros(6), np.array([0.0, 0.0, 1.0])
 STILL_S = COMMAND_TIMEOUT_NS / 1e9
-"""Longest gap between two ticks, and longest time in which no module obeys. After a longer one the microcontrollers have stopped all thrust
-(can_dbc/README.md), and the set-point restarts from the body."""
+"""Longest gap between two ticks, and longest time in which all modules say that they obey nothing. After a longer one the microcontrollers
+have stopped all thrust (can_dbc/README.md), and the set-point restarts at rest where the body is."""
 NEAR_M, NEAR_RAD = 0.2, 0.35
 """Largest distance, in m and rad, between set-point and body at which the set-point continues from where it is; otherwise it restarts from
 the body."""
@@ -241,7 +241,7 @@ class Guidance:
         dt_s = 0.0 if self._time_ns is None else (time_ns - self._time_ns) * 1e-9
         self._time_ns = time_ns
         if max(dt_s, health.still_s) > STILL_S:
-            self._glider.put(at_estimate(estimate))
+            self._glider.put(rest_at(estimate.p_wb, estimate.q_wb))
             self._start_ns = None if self._start_ns is None else self._start_ns + round(dt_s * 1e9)
             dt_s = 0.0
         if self.mode == Mode.AUTO and self._trajectory is not None and self._joined(self._trajectory, time_ns):
