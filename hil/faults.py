@@ -201,8 +201,8 @@ class Faults:
         Of two faults on the same part the later in the list wins; sags, pushes and errors of a pressure add up.
         """
         self._world.jet_strength = self._world.spec.jet_strength
-        for kind, is_so in self._box.items():
-            setattr(self._nodes.box, is_so, any(fault.kind == kind for fault in self._on))
+        for kind, attribute in self._box.items():
+            setattr(self._nodes.box, attribute, any(fault.kind == kind for fault in self._on))
         for number, mcu in self._nodes.mcus.items():
             mcu.imu_frozen = mcu.leaks = mcu.readings_absent = False
             mcu.depth.repair()
