@@ -19,7 +19,7 @@ from hil.nodes import Mcu, Nodes
 from hil.plant.camera import Sighting
 from hil.plant.docking import RELAY
 from hil.plant.draw import stream
-from hil.plant.fault_spec import ALL, DIRECTIONS, FACES, FRAME_KINDS, NO_BOX, NS, THRUSTER_KINDS, Fault
+from hil.plant.fault_spec import ALL, DIRECTIONS, FACES, FRAME_KINDS, NS, THRUSTER_KINDS, Fault
 
 NUMBER = 0x1F
 """Mask of the module number in a CAN id."""
@@ -147,9 +147,7 @@ class Faults:
         thrusters = {number: len(self._world.vehicles[mcu.module].thruster) for number, mcu in self._nodes.mcus.items()}
         if not thrusters:
             raise DescriptionError(f"fault.kind: no MCU of the plant's own is there for {fault.kind}; C nodes have no faults")
-        if fault.kind == "estop_box_silent" and not self._nodes.box.beats:
-            raise DescriptionError(f"fault.kind: {NO_BOX}")
-        for key, what in fault.mistakes(thrusters):
+        for key, what in fault.mistakes(thrusters, self._nodes.box.beats):
             raise DescriptionError(f"fault.{key}: {what}")
         self._faults.append(fault)
 

@@ -14,7 +14,6 @@ from firmware_py.description.vehicle import FACE_NAMES, Vehicle, face_mismatch, 
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
 from hil.metrics import AS_ASKED, DOCKING, SHOWN, shown
-from hil.plant.fault_spec import NO_BOX
 from hil.starts import MOVE_IN, hulls_in_walls, inscribed_radius_m, remedy, sphere_in_wall
 
 if TYPE_CHECKING:
@@ -292,14 +291,12 @@ def _vehicles(scenario: Scenario) -> dict[int, Vehicle]:
 def _in_faults(scenario: Scenario) -> Iterator[Mistake]:
     thrusters = {number: len(vehicle.thruster) for number, vehicle in _vehicles(scenario).items()}
     for i, fault in enumerate(scenario.fault):
-        for key, what in fault.mistakes(thrusters):
+        for key, what in fault.mistakes(thrusters, scenario.estop_box):
             yield ("fault", i, key), what
         if fault.at_s > scenario.duration_s:
             yield ("fault", i, "at_s"), f"{fault.at_s:g} s is after the end of the run, which lasts {scenario.duration_s:g} s"
         if fault.kind == "jets" and len(module_numbers(scenario)) < 2:
             yield ("fault", i, "kind"), "jets disturb a neighbour, and there is one module alone"
-        if fault.kind == "estop_box_silent" and not scenario.estop_box:
-            yield ("fault", i, "kind"), NO_BOX
 
 
 def _in_checks(scenario: Scenario) -> Iterator[Mistake]:

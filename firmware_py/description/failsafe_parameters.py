@@ -163,7 +163,8 @@ class Failsafes:
     module_silent_delay_s: float = delay(0.0, "FS_MOD_S")
     module_silent_action: int = action(2, "FS_MOD_ACT")
     module_silent_latched: int = latched(0, "FS_MOD_LAT")
-    # the e-stop box is unplugged or dead: nobody could stop the robot with it
+    # the e-stop box is unplugged or dead: nobody could stop the robot with it. The limit is ten of its HEARTBEATs, so that a bus that loses
+    # a third of its frames does not raise it
     estop_box_silent_limit: float = quantity(
         5.0, unit="s", low=1, high=60,
         help="longest permitted silence of the e-stop box, once it was heard; it sends HEARTBEAT at 2 Hz", mavlink="FS_EBOX_LIM"

@@ -16,8 +16,6 @@ ALL = -1
 FACES = len(FACE_NAMES)
 DIRECTIONS = ("to_plant", "from_plant", "both")
 NS = 1_000_000_000
-NO_BOX = "no e-stop box speaks here that could fall silent; give the scenario estop_box = true"
-"""Why the fault estop_box_silent is refused."""
 LARGEST = 1e6
 """Largest magnitude of a fault's value, in the unit of its kind."""
 
@@ -97,11 +95,12 @@ class Fault:
     )  # fmt: skip
     direction: str = quantity("both", choices=DIRECTIONS, help="frame faults: direction in which frames are affected")
 
-    def mistakes(self, thrusters: Mapping[int, int]) -> Iterator[tuple[str, str]]:
+    def mistakes(self, thrusters: Mapping[int, int], has_box: bool = False) -> Iterator[tuple[str, str]]:
         """Yields (key, message) for each value with which the fault would have no effect, or another than described.
 
         Args:
             thrusters: number of thrusters of each module, by module number.
+            has_box: whether an e-stop box sends HEARTBEAT.
         """
         takes = TAKES[self.kind]
         if round(self.until_s * NS) <= round(self.at_s * NS):
@@ -122,6 +121,8 @@ class Fault:
             yield "index", f"{self.index} is beyond what the module has for {self.kind}; it takes 0 to {last}, and -1 for all"
         elif not takes.part and self.index != ALL:
             yield "index", f"{self.index} is not for {self.kind}, which is of no thruster and no face; leave it out"
+        if self.kind == "estop_box_silent" and not has_box:
+            yield "kind", "no e-stop box speaks here that could fall silent; give the scenario estop_box = true"
 
     def is_on(self, time_ns: int) -> bool:
         """Whether the fault is active at `time_ns`."""
