@@ -43,6 +43,7 @@ class DetectorBench:
         """
         collector = InputCollector(self._fleet, self._codec)
         bank = PairBank([joint.pair for joint in joints_of(self._body)], Docking())
+        poses = ModulePoses(self._table, len(self._body.modules))
         with quiet_garbage():
             began = perf_counter_ns()
             for tick, frames in enumerate(self._ticks):
@@ -52,7 +53,8 @@ class DetectorBench:
                     collector.take(bus, frames[bus])
                 inputs = collector.collect(tick, time_ns)
                 if self._detects:
-                    bank.step(time_ns, inputs.modules, ModulePoses(inputs.modules, self._table))
+                    poses.take(inputs.modules)
+                    bank.step(time_ns, inputs.modules, poses)
             took_ns = perf_counter_ns() - began
         if self._detects and not bank.rows["holds"].all():
             raise RuntimeError(f"not all of {len(bank.rows)} joints were found docked")

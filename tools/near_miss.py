@@ -63,7 +63,7 @@ def fly_by(seed: int) -> Pass:
         Parameters().docking,
     )
     world.set_motion(1, velocity, np.zeros(3))
-    tags, seen = tag_table(bodies), (False, False, False)
+    poses, seen = ModulePoses(tag_table(bodies), len(fleet.module)), (False, False, False)
     for tick in range(1, round(PASS_S * 1e9) // PERIOD_NS + 1):
         time_ns = tick * PERIOD_NS
         commands = [ModuleCommand(False, np.zeros(8), wanted) for wanted in relays]
@@ -73,7 +73,8 @@ def fly_by(seed: int) -> Pass:
         if len(world.bodies) == 1:
             return Pass(*seen, joined=True)
         inputs = collector.collect(tick, time_ns)
-        status = detector.step(time_ns, inputs.modules, ModulePoses(inputs.modules, tags))
+        poses.take(inputs.modules)
+        status = detector.step(time_ns, inputs.modules, poses)
         seen = (seen[0] or status.current, seen[1] or status.position, seen[2] or status.docked)
     return Pass(*seen, joined=False)
 

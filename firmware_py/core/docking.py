@@ -51,7 +51,7 @@ class DockingStage:
 
     def __init__(self, parameters: Docking, tags: TagTable, modules: int) -> None:
         self._p = parameters
-        self._tags = tags
+        self._poses = ModulePoses(tags, modules)
         self.relays = MagnetRelays(modules)
         self._docks: list[Dock] = []
         self._undocks: list[Undock] = []
@@ -156,13 +156,13 @@ class DockingStage:
         """
         self.events, self.records, self._closed = [], [], []
         decisions = Decisions()
-        poses = ModulePoses(inputs.modules, self._tags)
+        self._poses.take(inputs.modules)
         for prepared in inputs.prepared:
             self._begin(prepared, inputs.time_ns, estimates, waiting, holding, decisions)
-        self._joints.step(inputs.time_ns, inputs.modules, poses, resting)
+        self._joints.step(inputs.time_ns, inputs.modules, self._poses, resting)
         traffic = Traffic(self._docks, estimates, coming, self._p)
         for dock in list(self._docks):
-            self._steer(dock, inputs, estimates, poses, traffic, decisions)
+            self._steer(dock, inputs, estimates, traffic, decisions)
         for undock in list(self._undocks):
             self._release(undock, inputs.time_ns, estimates, decisions)
         return decisions
@@ -281,21 +281,13 @@ class DockingStage:
 
     # ------------------------------------------------------------ each tick
 
-    def _steer(
-        self,
-        dock: Dock,
-        inputs: Inputs,
-        estimates: Estimated,
-        poses: ModulePoses,
-        traffic: Traffic,
-        decisions: Decisions,
-    ) -> None:
+    def _steer(self, dock: Dock, inputs: Inputs, estimates: Estimated, traffic: Traffic, decisions: Decisions) -> None:
         if blocked := traffic.blocked(dock):
             self._give_up(dock, blocked, decisions)
             self._end(dock.active, decisions)
             return
         active, target = estimates[dock.active][1], estimates[dock.target][1]
-        status = dock.detector.step(inputs.time_ns, inputs.modules, poses)
+        status = dock.detector.step(inputs.time_ns, inputs.modules, self._poses)
         before = dock.sequence.stage
         steering = dock.sequence.step(inputs.time_ns, active, target, status, self._wish(dock, traffic))
         stage = dock.sequence.stage

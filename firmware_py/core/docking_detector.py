@@ -9,12 +9,11 @@ All watched pairs are rows of one array, served by one compiled pass per tick.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
-from firmware_py.core.docking_pairs import PAIR, PICTURES, Limits, place_modules, watch
+from firmware_py.core.docking_pairs import KEPT, PAIR, PICTURES, Limits, keep_poses, watch
 from firmware_py.core.rotations import to_matrix
 from firmware_py.core.types import FACES, NEVER_NS, ModuleInputs
 from firmware_py.description.parameters import Docking
@@ -91,6 +90,7 @@ class PairBank:
         """Advances the rows to the tick at `time_ns`, by the inputs of that tick.
 
         Args:
+            poses: of the same modules, with those of this tick.
             resting: modules and faces whose magnets the limiter has switched off: their currents carry no information.
         """
         for m in self._watched:
@@ -99,7 +99,7 @@ class PairBank:
         for m, face in resting:
             if m in self._watched:
                 self._heard_ma[m, face] = np.nan
-        watch(self.rows, self._rings, self._heard_ma, *poses.sightings, time_ns, self._limits)
+        watch(self.rows, self._rings, self._heard_ma, poses.taken_ns, poses.poses, time_ns, self._limits)
 
     def status(self, i: int) -> PairStatus:
         """Status of pair `i`."""
@@ -127,47 +127,37 @@ class PairDetector:
         return a, b
 
 
-NOTHING = np.zeros((0, 2), dtype=np.int64), np.zeros((0, 12))
-"""`seen` and `poses` of no sightings."""
 TagTable = dict[tuple[int, int], np.ndarray]
 """(module, tag id) -> (7,) tag centre in the module frame, m, and quaternion from module frame to tag frame."""
 
 
-class Sightings(NamedTuple):
-    """Poses of single modules from the pictures of one tick, ordered by module, then by arrival."""
-
-    first: np.ndarray
-    """(m + 1,) index at which the sightings of each module of the fleet begin."""
-    seen: np.ndarray
-    """(s, 2) module, and capture time of the picture, ns."""
-    poses: np.ndarray
-    """(s, 12) the module's centre in the world, m, and its rotation matrix, row by row."""
-
-
 class ModulePoses:
-    """Poses of single modules from the pictures of one tick. Created each tick, and computed only if somebody asks."""
+    """Poses of single modules from the newest pictures. The tags of one picture may come in different ticks, as from buses that are not
+    equally fast.
 
-    def __init__(self, modules: Sequence[ModuleInputs], tags: TagTable) -> None:
-        self._modules = modules
+    Attributes:
+        taken_ns: (m, KEPT) capture time of each picture that shows a module of the fleet; NEVER_NS: none yet.
+        poses: (m, KEPT, 12) the module's centre in the world, m, and its rotation matrix, row by row.
+    """
+
+    def __init__(self, tags: TagTable, modules: int) -> None:
+        """`modules`: their number in the fleet."""
         self._tags = tags
+        self.taken_ns = np.full((modules, KEPT), NEVER_NS)
+        self.poses = np.zeros((modules, KEPT, 12))
 
-    @cached_property
-    def sightings(self) -> Sightings:
-        """Sightings by all observed tags that are in the table."""
-        times: list[int] = []
+    def take(self, modules: Sequence[ModuleInputs]) -> None:
+        """Takes the observations of this tick, of all tags that are in the table."""
+        seen: list[int] = []
         parts: list[np.ndarray] = []
-        for i, module in enumerate(self._modules):
+        for i, module in enumerate(modules):
             for tag in module.tags:
                 known = self._tags.get((i, tag.tag_id))
                 if known is not None:
-                    times += i, tag.capture_ns
+                    seen += i, tag.capture_ns
                     parts += tag.p_wt, tag.q_wt, known
-        if not parts:
-            return Sightings(np.zeros(len(self._modules) + 1, dtype=np.int64), *NOTHING)
-        seen = np.array(times, dtype=np.int64).reshape(-1, 2)
-        found = Sightings(np.empty(len(self._modules) + 1, dtype=np.int64), seen, np.empty((len(seen), 12)))
-        place_modules(np.concatenate(parts).reshape(-1, 14), *found)
-        return found
+        if parts:
+            keep_poses(np.concatenate(parts).reshape(-1, 14), np.array(seen, dtype=np.int64).reshape(-1, 2), self.taken_ns, self.poses)
 
 
 def _keys(rows: np.ndarray) -> list[tuple[int, ...]]:

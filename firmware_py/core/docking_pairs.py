@@ -19,6 +19,8 @@ PICTURES = 32
 """Relative positions kept of each pair: their mean distinguishes a locked pair from one that jammed 4 mm short of locking."""
 TURNED_TRACE = 1.0 + 2.0 * math.cos(math.radians(15.0))
 """Trace of a 15 degree rotation. If the measured relative attitude is farther off the docked one, a tag was read flipped."""
+KEPT = 16
+"""Newest pictures of each module, kept until the other module of a pair is seen in them too: those of two cameras at 60 Hz for 130 ms."""
 CURRENT, POSITION = 0, 1
 """The two conditions, as columns of a pair's row."""
 
@@ -61,10 +63,10 @@ class Limits(NamedTuple):
     pose_fresh_ns: int
 
 
-TABLE, FIRST, SEEN = numba.float64[:, ::1], numba.int64[::1], numba.int64[:, ::1]
+TAKEN, POSES = numba.int64[:, ::1], numba.float64[:, :, ::1]
 ROW = numba.from_dtype(PAIR)
 LIMITS = numba.typeof(Limits(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0, 0, 0))  # type: ignore[no-untyped-call]
-"""Types of the compiled functions' arguments: `poses` of docking_detector.Sightings, its `first` and `seen`, one PAIR, and the limits."""
+"""Types of the compiled functions' arguments: `taken_ns` and `poses` of docking_detector.ModulePoses, one PAIR, and the limits."""
 
 
 @njit(numba.void(ROW, numba.int64, numba.boolean, numba.int64, numba.int64), cache=True)
@@ -106,13 +108,15 @@ def _take_currents(row, heard_ma, time_ns, limits):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True)
-def _same_picture(first, seen, a, b):  # type: ignore[no-untyped-def]
-    """Indices of the sightings of modules a and b in the newest picture that shows both; -1, -1 without one."""
-    for i in range(first[a + 1] - 1, first[a] - 1, -1):
-        for j in range(first[b + 1] - 1, first[b] - 1, -1):
-            if seen[i, 1] == seen[j, 1]:
-                return i, j
-    return -1, -1
+def _same_picture(taken_ns, a, b, after_ns):  # type: ignore[no-untyped-def]
+    """Places, in `taken_ns`, of the newest picture after `after_ns` that shows both modules a and b; -1, -1 without one."""
+    at_a, at_b = -1, -1
+    for i in range(KEPT):
+        if taken_ns[a, i] > after_ns:
+            for j in range(KEPT):
+                if taken_ns[b, j] == taken_ns[a, i]:
+                    at_a, at_b, after_ns = i, j, taken_ns[a, i]
+    return at_a, at_b
 
 
 @njit(cache=True)
@@ -133,8 +137,8 @@ def _judge_ring(row, ring):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _as_turned(row, poses, i, j):  # type: ignore[no-untyped-def]
-    """Whether two sightings have the relative attitude that the modules have when docked.
+def _as_turned(row, pose_a, pose_b):  # type: ignore[no-untyped-def]
+    """Whether two poses (12,) have the relative attitude that the modules have when docked.
 
     A tag that is seen from 45 degrees and read flipped is off by a quarter turn, which is a lattice rotation too.
     """
@@ -142,23 +146,24 @@ def _as_turned(row, poses, i, j):  # type: ignore[no-untyped-def]
     for a in range(3):
         for b in range(3):
             for k in range(3):
-                trace += row.turn_a[3 * a + b] * poses[i, 3 + 3 * k + a] * poses[j, 3 + 3 * k + b]
+                trace += row.turn_a[3 * a + b] * pose_a[3 + 3 * k + a] * pose_b[3 + 3 * k + b]
     return trace > TURNED_TRACE
 
 
 @njit(cache=True)
-def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[no-untyped-def]
-    """Updates condition 2 by the pictures of this tick; returns whether the newest picture is fresh."""
-    i, j = _same_picture(first, seen, row.module[0], row.module[1])
-    if i >= 0 and _as_turned(row, poses, i, j):
+def _take_pose(row, ring, taken_ns, poses, time_ns, limits):  # type: ignore[no-untyped-def]
+    """Updates condition 2 by the newest picture of both modules; returns whether the newest one that was used is fresh."""
+    a, b = row.module
+    i, j = _same_picture(taken_ns, a, b, max(row.picture_ns, time_ns - limits.pose_fresh_ns - 1))
+    if i >= 0 and _as_turned(row, poses[a, i], poses[b, j]):
         here, off = ring[row.pictures % PICTURES], 0.0
         for axis in range(3):
             here[axis] = 0.0
             for k in range(3):
-                here[axis] += poses[i, 3 + 3 * k + axis] * (poses[j, k] - poses[i, k])
+                here[axis] += poses[a, i, 3 + 3 * k + axis] * (poses[b, j, k] - poses[a, i, k])
             off += (here[axis] - row.offset_a[axis]) ** 2
         row.pictures += 1
-        row.picture_ns = seen[i, 1]
+        row.picture_ns = taken_ns[a, i]
         if math.sqrt(off) <= limits.open_m:
             row.near_ns = row.picture_ns
         if row.pictures >= PICTURES:
@@ -173,19 +178,19 @@ def _take_pose(row, ring, first, seen, poses, time_ns, limits):  # type: ignore[
     return fresh
 
 
-@njit(numba.void(ROW[::1], numba.float64[:, :, ::1], TABLE, FIRST, SEEN, TABLE, numba.int64, LIMITS), cache=True)
-def watch(rows, rings, heard_ma, first, seen, poses, time_ns, limits):  # type: ignore[no-untyped-def]
+@njit(numba.void(ROW[::1], numba.float64[:, :, ::1], numba.float64[:, ::1], TAKEN, POSES, numba.int64, LIMITS), cache=True)
+def watch(rows, rings, heard_ma, taken_ns, poses, time_ns, limits):  # type: ignore[no-untyped-def]
     """Advances all pairs to this tick.
 
     Args:
         rows: (k,) PAIR; rings: (k, PICTURES, 3) relative positions, module b in the frame of a.
         heard_ma: (m, 6) currents received, per module and face, NaN where none came; reset to NaN afterwards.
-        first, seen, poses: docking_detector.Sightings.
+        taken_ns, poses: of docking_detector.ModulePoses.
     """
     for k in range(rows.shape[0]):
         row = rows[k]
         fresh_current = _take_currents(row, heard_ma, time_ns, limits)
-        fresh_pose = _take_pose(row, rings[k], first, seen, poses, time_ns, limits)
+        fresh_pose = _take_pose(row, rings[k], taken_ns, poses, time_ns, limits)
         weak = fresh_current and row.holds[CURRENT] == 0 and row.candidate_ns[CURRENT] == NEVER_NS
         far = fresh_pose and row.error_m > limits.open_m
         row.open = CLOSED
@@ -194,21 +199,26 @@ def watch(rows, rings, heard_ma, first, seen, poses, time_ns, limits):  # type: 
     heard_ma[:] = math.nan
 
 
-@njit(numba.void(TABLE, FIRST, SEEN, TABLE), cache=True)
-def place_modules(tags, first, seen, poses):  # type: ignore[no-untyped-def]
-    """Writes `first` and `poses` of docking_detector.Sightings.
+@njit(numba.void(numba.float64[:, ::1], TAKEN, TAKEN, POSES), cache=True)
+def keep_poses(tags, seen, taken_ns, poses):  # type: ignore[no-untyped-def]
+    """Writes the poses of modules into `taken_ns` and `poses` of docking_detector.ModulePoses, each in the place of the same picture, or
+    else of the oldest.
 
     Args:
-        tags: (s, 14) per sighting the tag's position and attitude in the world, its position in its module, and the quaternion from
+        tags: (s, 14) per observation the tag's position and attitude in the world, its position in its module, and the quaternion from
             module frame to tag frame.
+        seen: (s, 2) module, and capture time of the picture, ns.
     """
-    i = 0
-    for module in range(first.shape[0]):
-        first[module] = i
-        while i < seen.shape[0] and seen[i, 0] == module:
-            tag = tags[i]
-            turn = to_matrix(multiply(tag[3:7], tag[10:14]))
-            for k in range(3):
-                poses[i, k] = tag[k] - turn[k, 0] * tag[7] - turn[k, 1] * tag[8] - turn[k, 2] * tag[9]
-                poses[i, 3 + 3 * k : 6 + 3 * k] = turn[k]
-            i += 1
+    for k in range(tags.shape[0]):
+        tag, m, at = tags[k], seen[k, 0], 0
+        for i in range(KEPT):
+            if taken_ns[m, i] == seen[k, 1]:
+                at = i
+                break
+            if taken_ns[m, i] < taken_ns[m, at]:
+                at = i
+        taken_ns[m, at] = seen[k, 1]
+        turn = to_matrix(multiply(tag[3:7], tag[10:14]))
+        for axis in range(3):
+            poses[m, at, axis] = tag[axis] - turn[axis, 0] * tag[7] - turn[axis, 1] * tag[8] - turn[axis, 2] * tag[9]
+            poses[m, at, 3 + 3 * axis : 6 + 3 * axis] = turn[axis]

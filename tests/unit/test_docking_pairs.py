@@ -37,6 +37,7 @@ class Row:
     camera: bool = True
     tick: int = 0
     rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+    poses: ModulePoses = field(default_factory=lambda: ModulePoses(TAGS, 4))
 
     def hear(self) -> tuple[int, list[ModuleInputs]]:
         """Time and inputs of the next tick: currents at 25 Hz, pictures at 50 Hz."""
@@ -56,11 +57,16 @@ class Row:
         p_wt = p_wt + self.noise_m * self.rng.standard_normal(3)
         return TagObservation(TAG, 7, self.tick * TICK_NS - 40_000_000, p_wt, multiply(self.attitude, conjugate(TURN)))
 
+    def seen(self, modules: list[ModuleInputs]) -> ModulePoses:
+        """The poses of the modules, with those by the inputs of this tick."""
+        self.poses.take(modules)
+        return self.poses
+
     def watch(self, bank: PairBank, seconds: float) -> list[PairStatus]:
         """Steps `bank` for `seconds`; returns the status of every pair."""
         for _ in range(round(seconds / 0.01)):
             time_ns, modules = self.hear()
-            bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+            bank.step(time_ns, modules, self.seen(modules))
         return [bank.status(i) for i in range(len(bank.rows))]
 
 
@@ -130,7 +136,7 @@ def test_current_of_one_face_alone_does_not_count(row: Row, silent: int, heard_s
         time_ns, modules = row.hear()
         if len(seen) >= 100 * heard_s:
             modules[silent].docks.clear()
-        seen.append(detector.step(time_ns, modules, ModulePoses(modules, TAGS)).current)
+        seen.append(detector.step(time_ns, modules, row.seen(modules)).current)
     last_heard = round(100 * heard_s)
     assert seen[last_heard - 1] == (heard_s > 0.0)
     assert not any(seen[last_heard + round(P.current_fresh_ms / 10.0) :])
@@ -147,7 +153,7 @@ def test_current_of_every_face_is_heard(row: Row, faces: tuple[int, int]) -> Non
         for module, face in zip(modules, faces, strict=False):
             currents = [100.0 if face == each else 0.0 for each in range(6)]
             module.docks = [DockFeedback(first, tuple(currents[first : first + 3]), (1, 1, 1)) for first in (0, 3)]
-        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        bank.step(time_ns, modules, row.seen(modules))
     assert bank.status(0).docked
 
 
@@ -157,7 +163,7 @@ def test_magnet_that_the_limiter_rests_tells_nothing(row: Row) -> None:
     row.currents_ma = [0.0, 0.0, 0.0]
     for _ in range(100):
         time_ns, modules = row.hear()
-        bank.step(time_ns, modules, ModulePoses(modules, TAGS), resting=[(0, 0), (1, 1), (7, 0)])
+        bank.step(time_ns, modules, row.seen(modules), resting=[(0, 0), (1, 1), (7, 0)])
     assert bank.rows["open"].tolist() == [CLOSED, LOOSE]
 
 
@@ -167,7 +173,7 @@ def test_module_that_is_not_in_the_picture_is_not_placed_by_its_neighbours(row: 
     for _ in range(100):
         time_ns, modules = row.hear()
         modules[missing].tags.clear()
-        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        bank.step(time_ns, modules, row.seen(modules))
     assert [bank.status(i).position for i in range(3)] == [missing not in (i, i + 1) for i in range(3)]
 
 
@@ -181,7 +187,7 @@ def test_newest_of_several_pictures_counts(row: Row) -> None:
         time_ns, modules = row.hear()
         for module, before in zip(modules, older, strict=True):
             module.tags[:0] = [tag._replace(capture_ns=tag.capture_ns - 16_000_000) for tag in before.tags]
-        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        bank.step(time_ns, modules, row.seen(modules))
     assert all(bank.status(i).docked for i in range(3))
 
 
@@ -278,7 +284,7 @@ def test_locked_pair_is_found_in_noise_and_through_flipped_tags(row: Row) -> Non
         if n % 10 in (1, 3):
             assert modules[1].tags
             modules[1].tags = [t._replace(q_wt=multiply(t.q_wt, from_euler(0.3, 0.0, 0.0))) for t in modules[1].tags]
-        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        bank.step(time_ns, modules, row.seen(modules))
         assert n < 150 or bank.status(0).docked
 
 
@@ -291,7 +297,7 @@ def test_flipped_tag_that_is_off_by_a_quarter_turn_opens_no_joint(row: Row, flip
         if n % 10 == 1:
             assert modules[1].tags
             modules[1].tags = [t._replace(q_wt=multiply(t.q_wt, from_euler(*flip))) for t in modules[1].tags]
-        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        bank.step(time_ns, modules, row.seen(modules))
         assert n < 100 or (bank.status(0).docked and bank.rows["open"][0] == CLOSED)
 
 
@@ -299,11 +305,12 @@ def test_flipped_tag_that_is_off_by_a_quarter_turn_opens_no_joint(row: Row, flip
 def test_modules_that_are_docked_turned_are_found_so(row: Row, turn: np.ndarray) -> None:
     """Only with the rotation that the pair specifies."""
     tags: TagTable = {(0, TAG): TAGS[0, TAG], (1, TAG): np.r_[rotate(conjugate(turn), LEVERS[1]), multiply(TURN, turn)]}
+    row.poses = ModulePoses(tags, 4)
     for q_ab, found in ((turn, True), (np.array([1.0, 0.0, 0.0, 0.0]), False)):
         bank = PairBank([ROW[0]._replace(q_ab=q_ab)], P)
         for _ in range(100):
             time_ns, modules = row.hear()
-            bank.step(time_ns, modules, ModulePoses(modules, tags))
+            bank.step(time_ns, modules, row.seen(modules))
         assert bank.status(0).position == found
 
 
@@ -312,7 +319,7 @@ def test_tag_that_the_vehicle_does_not_carry_places_nobody(row: Row) -> None:
     for _ in range(100):
         time_ns, modules = row.hear()
         modules[0].tags = [tag._replace(tag_id=14) for tag in modules[0].tags]
-        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        bank.step(time_ns, modules, row.seen(modules))
     assert not bank.status(0).position and bank.status(0).current
 
 
@@ -321,8 +328,32 @@ def test_pictures_of_different_times_place_nobody(row: Row) -> None:
     for _ in range(100):
         time_ns, modules = row.hear()
         modules[0].tags = [tag._replace(capture_ns=tag.capture_ns - 1) for tag in modules[0].tags]
-        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        bank.step(time_ns, modules, row.seen(modules))
     assert not bank.status(0).position
+
+
+@pytest.mark.parametrize("late", [0, 1])
+@pytest.mark.parametrize(("late_ticks", "found"), [(2, True), (40, False)])
+def test_picture_counts_whose_tags_come_in_different_ticks(row: Row, late: int, late_ticks: int, found: bool) -> None:
+    """As from two buses, one of them slower by 20 ms. Tags that are 440 ms old are of no use."""
+    bank, waiting = PairBank(ROW[:1], P), list[list[TagObservation]]()
+    for _ in range(150):
+        time_ns, modules = row.hear()
+        waiting.append(modules[late].tags)
+        modules[late].tags = waiting.pop(0) if len(waiting) > late_ticks else []
+        bank.step(time_ns, modules, row.seen(modules))
+    assert bank.status(0).position == found
+
+
+def test_picture_is_counted_once(row: Row) -> None:
+    """A second tag of a module in a picture that was used, and pictures that stay the newest ones, change nothing."""
+    bank = PairBank(ROW[:1], P)
+    for _ in range(20):
+        time_ns, modules = row.hear()
+        bank.step(time_ns, modules, row.seen(modules))
+        modules[1].tags = [tag._replace(p_wt=tag.p_wt + 0.1) for tag in modules[1].tags]
+        bank.step(time_ns, modules, row.seen(modules))
+    assert bank.rows["pictures"][0] == 10
 
 
 @pytest.mark.slow
@@ -333,9 +364,9 @@ def test_many_pairs_are_each_as_one_alone(row: Row) -> None:
         row.camera = n // 100 % 3 != 2
         row.currents_ma = [75.0 + 25.0 * math.sin(0.01 * n * k) for k in (3.0, 5.0, 7.0)]
         time_ns, modules = row.hear()
-        bank.step(time_ns, modules, ModulePoses(modules, TAGS))
+        bank.step(time_ns, modules, row.seen(modules))
         for i, detector in enumerate(alone):
-            np.testing.assert_equal(detector.step(time_ns, modules, ModulePoses(modules, TAGS)), bank.status(i))
+            np.testing.assert_equal(detector.step(time_ns, modules, row.poses), bank.status(i))
 
 
 def test_joints_go_on_when_other_joints_come_and_go(row: Row) -> None:
