@@ -14,7 +14,7 @@ from firmware_py.core.types import Action, DockRequest, Mode, Outputs, Request
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.prepare import paths
-from hil.orders import Orders, is_time_to_arm
+from hil.orders import Orders, heartbeats, is_time_to_arm
 from hil.scenario import Scenario, Step
 from hil.script import refuse_outside
 
@@ -49,14 +49,14 @@ class DockScript(Orders):
         asked = self._arm(time_ns, last)
         if time_ns < self._scenario.task.begin_ns:
             return asked
-        if any([self._is_given_up(r, last) for r in self._running]):  # the later steps no longer make sense
-            self._running, self._steps = [], []
+        if any([self._is_given_up(r, last) for r in self._running]):  # the later steps no longer make sense, except for waiting
+            self._running, self._steps = [], [step for step in self._steps if step.do == "wait"]
         self._running = [r for r in self._running if not self._is_over(r, time_ns)]
         while self._steps and (not self._running or self._steps[0].also):
             asked += self._begin(self._steps.pop(0), time_ns, last)
         if not self._running and not self._steps and self._over_ns is None:
             self._over_ns = time_ns
-        return asked
+        return asked + heartbeats(time_ns, self._fleet, self._scenario.task)
 
     def is_over(self, time_ns: int) -> bool:
         """Whether every step has been over for AFTERWARDS_NS."""

@@ -18,15 +18,16 @@ from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import Vehicle, load_vehicle
 from hil.bench import fly_scenario
-from hil.fault_table import AT_S, NAME, PLACED, ROWS, Row
+from hil.fault_table import AT_S, COLUMNS, DOCK, DOCKED, NAME, PLACED, ROWS, Row
 from hil.flight import LOGS, flight_of
 from hil.metrics import errors
+from hil.plant.fault_spec import TAKES, Fault
 from hil.replaceable import check_replaceable, created_folder, is_json_with
-from hil.scenario import MODES, Scenario, load_scenario
+from hil.scenario import Scenario, load_scenario
 from hil.signals import Flight
 from hil.workers import Pool
 
-SCENARIO = "faults"
+SCENARIO, DOCK_SCENARIO = "faults", "faults-dock"
 RESULT_FILE = "faults.json"
 LEAD_S = 0.015
 """Includes the tick before the fault, so that an immediate change is seen as a change."""
@@ -52,10 +53,15 @@ class Cell(NamedTuple):
 
 
 def scenario_of(row: Row, mode: str) -> Scenario:
-    """The scenario of one cell."""
-    base = load_scenario(SCENARIO)
-    task = dataclasses.replace(base.task, mode=mode, **row.task)
-    return dataclasses.replace(base, task=task, fault=(row.fault, *row.also) if row.fault is not None else ())
+    """The scenario of one cell. In a dock, the active module alone is faulty, which is the first, unless the fault is one of the bus."""
+    base = load_scenario(DOCK_SCENARIO if mode == DOCK else SCENARIO)
+    task = dataclasses.replace(base.task, **(row.task if mode == DOCK else {"mode": mode, **row.task}))
+    faults = (row.fault, *row.also) if row.fault is not None else ()
+    return dataclasses.replace(base, task=task, fault=tuple(map(_in_first, faults) if mode == DOCK else faults))
+
+
+def _in_first(fault: Fault) -> Fault:
+    return dataclasses.replace(fault, module=1) if TAKES[fault.kind].one_module else fault
 
 
 def fly_cell(row: Row, mode: str, seed: int, parameters: Parameters | None = None) -> Cell:
@@ -72,8 +78,10 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Vehicle) -> Cell:
     after = flight.between(round((AT_S - LEAD_S) * 1e9), 1 << 62)
     time_s = after.firmware["time_ns"] * 1e-9 - AT_S
     names = [_name(int(state), int(now)) for state, now in zip(after.firmware["state"], after.firmware["mode"], strict=True)]
-    wanted = row.ends.get(mode, mode)
+    is_docked = after.firmware["tick"][-1] < after.ticks["tick"][-1]  # the active body is no more
+    end, wanted = DOCKED if is_docked else names[-1], row.ends.get(mode, DOCKED if mode == DOCK else mode)
     changes = [i for i in range(1, len(names)) if names[i] != names[i - 1]]
+    changes += [len(names) - 1] if is_docked else []
     reached_s = float(time_s[changes[-1]]) if changes else 0.0
     told = _told(flight)
     said_s = [at_s for text, at_s in told if row.says and row.says in text]
@@ -81,16 +89,16 @@ def judge(row: Row, mode: str, flight: Flight, vehicle: Vehicle) -> Cell:
     blamed = {found[0] for text, _ in told for found in BLAMED.finditer(text)} - ({NAME} if row.leaves_out else set())
     broken = {
         f"was in {names[0]} when it began": names[0] != mode,
-        f"left {mode} for {next((name for name in names if name != mode), '')}": wanted == mode and bool(changes),
-        f"ended in {names[-1]}, not {wanted}": names[-1] != wanted,
-        f"took {reached_s:.2f} s": wanted != mode and reached_s > row.within_s,
+        f"left {mode} for {next((name for name in names if name != mode), end)}": wanted == mode and bool(changes),
+        f"ended in {end}, not {wanted}": end != wanted,
+        f"took {reached_s:.2f} s": mode in row.ends and reached_s > row.within_s,
         f"{error_m * 1e3:.0f} mm off": error_m > row.error_m,
         f"{angle_deg:.0f} deg off": angle_deg > row.angle_deg,
         f"did not say {row.says!r}": bool(row.says) and mode in row.says_in and not said_s,
         f"blamed {', '.join(sorted(blamed))}": bool(blamed) or (not row.leaves_out and any("left out" in text for text, _ in told)),
         **_wrong_commands(after.firmware["commanded_n"], names, vehicle),
     }
-    happened = f"{names[-1]} {reached_s:.2f} s" if changes else "as before"
+    happened = f"{end} {reached_s:.2f} s" if changes else "as before"
     happened += f", said {said_s[0]:.1f} s" if said_s and not changes else ""
     happened += f", {error_m * 1e3:.0f} mm" if np.isfinite(error_m) else ""
     return Cell(row.name, mode, happened, tuple(words for words, is_so in broken.items() if is_so), row.promise)
@@ -140,7 +148,7 @@ def run_fault_campaign(pool: Pool, out: Path, seed: int = 0, progress: Callable[
         check_replaceable(out, (RESULT_FILE, *LOGS), is_json_with(out / RESULT_FILE, "promise"), "campaign of faults")
         cells: list[Cell] = []
         with pool() as executor:
-            futures = [executor.submit(fly_cell, row, mode, seed) for row in ROWS for mode in MODES]
+            futures = [executor.submit(fly_cell, row, mode, seed) for row in ROWS for mode in COLUMNS]
             for future in futures:
                 cells.append(future.result())
                 if progress is not None:

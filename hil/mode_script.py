@@ -12,11 +12,9 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode, Outputs, Request, Setpoint, Sticks
 from firmware_py.description.fleet import Fleet
 from firmware_py.prepare import paths
-from hil.orders import Orders, is_due, is_time_to_arm
+from hil.orders import STREAM_EVERY_S, Orders, heartbeats, is_due, is_time_to_arm
 from hil.scenario import Scenario
 
-STREAM_EVERY_S = 0.1
-"""Period of sticks, set-points and the ground station's heartbeat."""
 PILOTED = (Mode.MANUAL, Mode.STABILIZE, Mode.ALT_HOLD)
 RADIUS_M, TURN_S = 0.25, 15.0
 """Circle of AUTO and of GUIDED's set-points, and the time for one lap."""
@@ -42,10 +40,9 @@ class ModeScript(Orders):
             return []
         asked = [] if self._begun else self._begin()
         self._begun = True
-        if is_due(time_ns, self._fleet, STREAM_EVERY_S):
-            asked += self._stream(1e-9 * (time_ns - self._task.begin_ns)) if time_ns < self._task.pilot_until_s * 1e9 else []
-            asked += [Request(Action.GROUND_ALIVE)] if time_ns < self._task.ground_until_s * 1e9 else []
-        return asked
+        if is_due(time_ns, self._fleet, STREAM_EVERY_S) and time_ns < self._task.pilot_until_s * 1e9:
+            asked += self._stream(1e-9 * (time_ns - self._task.begin_ns))
+        return asked + heartbeats(time_ns, self._fleet, self._task)
 
     def _begin(self) -> list[Request]:
         if self._mode == Mode.AUTO:

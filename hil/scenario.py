@@ -129,7 +129,7 @@ class Task:
     mode: str = quantity("POSHOLD", choices=MODES, help="mode: the mode to stay in")
     pilot_until_s: float = quantity(1e6, unit="s", low=0, high=1e6, help="mode: time of the run until which sticks and set-points stream")
     ground_until_s: float = quantity(
-        0.0, unit="s", low=0, high=1e6, help="mode: time of the run until which a ground station is heard; 0: never"
+        0.0, unit="s", low=0, high=1e6, help="mode, dock: time of the run until which a ground station is heard; 0: never"
     )
     settle_s: float = quantity(15.0, unit="s", low=0, high=600, help="time that the robot holds its start before the task begins")
     duration_s: float = quantity(unit="s", low=0.1, high=7200, help="duration of the task itself, from rest to rest")

@@ -35,7 +35,7 @@ OWN_KEYS = {
         "moebius": ("centre_m", "radius_m", "half_width_m", "turns"),
         "lissajous": ("centre_m", "amplitude_m", "frequency", "turns", "yaw_turns", "roll_turns"),
         "waypoints": ("file",),
-        "dock": (),
+        "dock": ("ground_until_s",),
         "force": ("stick",),
         "mode": ("centre_m", "mode", "pilot_until_s", "ground_until_s"),
     },

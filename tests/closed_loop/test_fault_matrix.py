@@ -12,13 +12,12 @@ import hil.fault_campaign
 from firmware_py.description.parameters import Parameters
 from hil.fault_campaign import Cell, fly_cell, run_fault_campaign
 from hil.fault_matrix import print_faults
-from hil.fault_table import ROWS, Row
+from hil.fault_table import COLUMNS, ROWS, Row
 from hil.plant.fault_spec import TAKES
-from hil.scenario import MODES
 
 BY_NAME = {row.name: row for row in ROWS}
-ELSEWHERE = {"magnet", "jets"}
-"""Faults of docking bodies, tested elsewhere."""
+ELSEWHERE = {"jets"}
+"""Faults that only the load cell shows, tested elsewhere."""
 
 
 def test_table_breaks_everything_that_can_break() -> None:
@@ -33,11 +32,20 @@ def test_robot_that_holds_its_place_keeps_its_promise(row: Row) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("mode", [mode for mode in MODES if mode != "POSHOLD"])
+@pytest.mark.parametrize("mode", [mode for mode in COLUMNS if mode != "POSHOLD"])
 def test_leak_brings_the_robot_up_from_every_mode(mode: str) -> None:
     cell = fly_cell(BY_NAME["leak"], mode, 0)
     assert cell.broken == ()
     assert cell.happened.startswith("as before" if mode == "SURFACE" else "SURFACE 0.6")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("fault", "mode"),
+    [("frames 20 ms late", "DOCK"), ("tags absent", "DOCK"), ("magnet dead", "DOCK")],
+)
+def test_body_that_docks_keeps_its_promise(fault: str, mode: str) -> None:
+    assert fly_cell(BY_NAME[fault], mode, 0).broken == ()
 
 
 @pytest.mark.slow
@@ -69,7 +77,7 @@ def test_campaign_writes_every_cell_with_its_promise(tmp_path: Path, monkeypatch
     monkeypatch.setattr(hil.fault_campaign, "fly_cell", lambda row, mode, seed: Cell(row.name, mode, "as before", (), row.promise))
     cells = run_fault_campaign(partial(ThreadPoolExecutor, 1), tmp_path)
     entries = json.loads((tmp_path / "faults.json").read_text())
-    assert len(cells) == len(entries) == len(ROWS) * len(MODES)
+    assert len(cells) == len(entries) == len(ROWS) * len(COLUMNS)
     assert entries[0] == {
         "fault": "thruster dead", "mode": "MANUAL", "happened": "as before", "broken": [], "promise": "left out; 60 mm, 15 deg",
         "passed": True,

@@ -31,7 +31,7 @@ def held(mode: Mode = Mode.POSHOLD) -> Flight:
         "tag_age_ns": np.zeros(TICKS, np.int64), "commanded_n": np.ones((TICKS, 8)),
     }  # fmt: skip
     events = {"log_time": np.zeros(0, np.int64), "severity": np.zeros(0, np.int64), "text": np.zeros(0, str)}
-    return Flight(firmware, {"p_wb": np.zeros((TICKS, 3)), "q_wb": q}, events, {}, np.zeros(0))
+    return Flight(firmware, {"p_wb": np.zeros((TICKS, 3)), "q_wb": q}, events, {"tick": firmware["tick"]}, np.zeros(0))
 
 
 def broken(row: str, change: Change = lambda flight: None, mode: str = "POSHOLD") -> tuple[str, ...]:
@@ -100,6 +100,24 @@ def test_promise_that_is_kept_is_not_broken() -> None:
 )
 def test_promise_that_was_broken_is_named(row: str, change: Change, words: str) -> None:
     assert words in broken(row, change)
+
+
+def docked_after(seconds: float) -> Change:
+    """A change that ends the body's own signals `seconds` after the fault, because it became one with another."""
+
+    def change(flight: Flight) -> None:
+        for columns in (flight.firmware, flight.truth):
+            columns.update({name: column[: round(100 * (AT_S + seconds))] for name, column in columns.items()})
+
+    return change
+
+
+def test_dock_that_succeeds_is_kept_and_one_that_does_not_is_named() -> None:
+    assert broken(AS_BEFORE, docked_after(6.0), "DOCK") == () == broken("pilot silent", docked_after(6.0), "DOCK")
+    assert broken(AS_BEFORE, mode="DOCK") == ("ended in DOCK, not DOCKED",)
+    assert broken("magnet dead", mode="DOCK") == ()
+    assert broken("magnet dead", docked_after(6.0), "DOCK") == ("left DOCK for DOCKED", "ended in DOCKED, not DOCK")
+    assert broken("e-stop box silent", docked_after(1.0), "DOCK") == ("ended in DOCKED, not POSHOLD", "did not say 'e-stop box silent for'")
 
 
 @pytest.mark.parametrize(("vehicle", "words"), [("bluerov2", ()), ("modcube", ("60 deg off",))])
