@@ -12,7 +12,7 @@ from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import Setpoint
 from firmware_py.ground.mission_flight import Plan, PlanJob
 from firmware_py.ground.mission_legs import GO_TO, Leg
-from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, distinct, plan
+from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, distinct, hasten, plan
 from firmware_py.prepare.piecewise import Piecewise
 
 _SAME = 1e-3
@@ -21,6 +21,8 @@ _ANGULAR_RATE, _ANGULAR_ACCELERATION = 0.5, 0.5
 """rad/s and rad/s^2. Turns on the way are gentle, so that the tag stays readable."""
 _LEAST_SHARE = 1e-3
 """Least share of a speed that is permitted along an axis: an axis that does not move needs a limit above zero too."""
+_MOVED_M = 0.002
+"""By how much a path may move when its timing changes: its corridor is narrower by so much before."""
 _THRUSTER_SHARE = 0.6
 """Share of each thruster's range that a mission may use; the rest is reserved against the current."""
 
@@ -52,9 +54,10 @@ def plan_mission(job: PlanJob, body: Body | None, wanted: Callable[[], bool] = l
         for section in _sections(job.legs):
             points, places = _waypoints(p_wb, q_wb, section)
             if len(points) > 1:
-                path = plan(points, None, _limits(job, _velocity(points, section[0].speed_m_s)), body, wanted=wanted)
+                speed, limits = section[0].speed_m_s, _limits(job, _velocity(points, section[0].speed_m_s))
+                path, passed_s = hasten(plan(points, None, limits, body, wanted=wanted), speed, points, limits, body)
                 parts.append((at_s, path))
-                arrivals += [at_s + float(path.breaks[place]) for place in places]
+                arrivals += [at_s + float(passed_s[place]) for place in places]
                 at_s += path.duration_s
             else:
                 arrivals += [at_s] * len(section)
@@ -115,7 +118,7 @@ def _limits(job: PlanJob, velocity: np.ndarray) -> Limits:
     return Limits(
         velocity=velocity,
         acceleration=np.full(3, job.acceleration),
-        corridor_m=job.corridor_m,
+        corridor_m=job.corridor_m - _MOVED_M,
         angular_rate=_ANGULAR_RATE,
         angular_acceleration=_ANGULAR_ACCELERATION,
         thruster_share=_THRUSTER_SHARE,

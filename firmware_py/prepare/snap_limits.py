@@ -185,12 +185,12 @@ class _Table:
 
     def excess(self, coefficients: np.ndarray, durations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """(m,) largest |normal . derivative - centre| over bound on each piece, and (m,) the share of the piece at which it is."""
-        grid = _towards_ends(np.arange(_CHECK_POINTS + 1) / _CHECK_POINTS)
+        grid = towards_ends(np.arange(_CHECK_POINTS + 1) / _CHECK_POINTS)
         rows = np.stack([derivative_rows(grid, order) for order in range(3)])[self.order]
         sampled = self._used(rows, coefficients, durations)
         heights, places = crests(sampled)
         each = np.arange(len(sampled))
-        u = _towards_ends(places[each, heights.argmax(axis=1)] / _CHECK_POINTS)
+        u = towards_ends(places[each, heights.argmax(axis=1)] / _CHECK_POINTS)
         rows = np.stack([derivative_rows(u, order) for order in range(3)])[self.order, each]
         crest, at_points = self._used(rows[:, None], coefficients, durations)[:, 0], sampled.max(axis=1)
         return np.maximum(crest, at_points), np.where(crest > at_points, u, grid[sampled.argmax(axis=1)])
@@ -202,7 +202,7 @@ class _Table:
         return np.asarray(np.abs(values - self.centre[:, None]) / self.bound[:, None])
 
 
-def _towards_ends(share: np.ndarray) -> np.ndarray:
+def towards_ends(share: np.ndarray) -> np.ndarray:
     """Shares of a piece, denser near its ends as Chebyshev's points are: there a polynomial may turn most sharply."""
     return 0.5 - 0.5 * np.cos(math.pi * share)
 
@@ -253,7 +253,7 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
     knots = Knots(knots.value / unit_m, knots.fixed, knots.derivative / unit_m)
     problem = _Problem(system, knots, start / unit_m)
     index = np.repeat(np.arange(len(limits)), _FIRST_POINTS)
-    where = np.tile(_towards_ends(np.arange(_FIRST_POINTS) / _FIRST_POINTS), len(limits))
+    where = np.tile(towards_ends(np.arange(_FIRST_POINTS) / _FIRST_POINTS), len(limits))
     for _ in range(_ROUNDS):
         try:
             unknown, conflict = problem.solve(table, index, where)

@@ -120,6 +120,21 @@ def test_leg_from_a_stop_to_a_stop_reaches_the_speed_that_was_asked_for_and_no_m
     assert 0.29 < max(speeds) <= 0.3 * (1.0 + 1e-6)
 
 
+def test_lanes_are_flown_at_their_speed_within_the_corridor() -> None:
+    """Regression: the same lanes took 3.5 times as long as at their speed throughout, longer than with a stop at each end."""
+    places, corridor_m = [np.array([10.0 * (k % 4 in (1, 2)), k // 2, 2.0]) for k in range(5)], 0.1
+    legs = tuple(Leg(k, place, 0.4 * k, 0.0, 0.3) for k, place in enumerate(places[1:]))
+    plan = plan_mission(PlanJob(1, 0, places[0], np.array([1.0, 0.0, 0.0, 0.0]), legs, 0.1, corridor_m), None)
+    assert plan.trajectory is not None
+    assert plan.arrivals_s[-1] == pytest.approx(plan.trajectory.duration_s) and plan.arrivals_s[-1] < 1.5 * 22.0 / 0.3
+    for a, b, *times in zip(places, places[1:], (0.0, *plan.arrivals_s), plan.arrivals_s, strict=False):
+        along = (b - a) / np.linalg.norm(b - a)
+        ways = np.array([plan.trajectory.sample(t).p_wb - a for t in np.linspace(*times, 500)])
+        assert np.linalg.norm(ways - np.outer(ways @ along, along), axis=1).max() <= corridor_m
+        assert -corridor_m <= (ways @ along).min() and (ways @ along).max() <= np.linalg.norm(b - a) + corridor_m
+        np.testing.assert_allclose(ways[-1] + a, b, atol=1e-6)
+
+
 @pytest.mark.parametrize(("asked", "flown"), [(-1.0, 0.3), (-2.0, 0.15)])
 def test_speed_of_minus_one_is_as_before_and_minus_two_the_parameters(world: World, client: Client, asked: float, flown: float) -> None:
     client.command(178, 1, 0.3)

@@ -35,6 +35,7 @@ REQUESTS = [
     Request(Action.TRACK, 0, paths.spiral(np.zeros(3), 0.3, 0.4, 2.0, 40.0)),
     Request(Action.TRACK, 0, paths.line(PLACE, PLACE, 4.0)),
     Request(Action.TRACK, 0, SNAP),
+    Request(Action.TRACK, 0, dataclasses.replace(SNAP, coefficients=RNG.normal(size=(15, 10, 7)), breaks=np.arange(16.0))),
     Request(Action.TRACK, 0, Consecutive(((0.0, SNAP), (4.5, SNAP)), 9.0)),
 ]
 

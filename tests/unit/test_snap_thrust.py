@@ -64,9 +64,10 @@ def believed(x: np.ndarray) -> Estimate:
 @pytest.mark.parametrize("yaw", [None, 0.785])
 @pytest.mark.parametrize("place", [NORTH, EAST, NORTH + EAST - START], ids=["north", "east", "north-east"])
 def test_vehicle_that_leaves_an_axis_to_buoyancy_has_its_missions_planned(passive: Body, place: np.ndarray, yaw: float | None) -> None:
+    """As long as for one that leaves none, but for a hundredth or two where it would lean too far."""
     six = assemble_vehicle(load_vehicle("bluerov2_heavy"))
     expected = flown(plan_mission(job(place, yaw=yaw), six)).duration_s
-    assert flown(plan_mission(job(place, yaw=yaw), passive)).duration_s == pytest.approx(expected, rel=0.01)
+    assert flown(plan_mission(job(place, yaw=yaw), passive)).duration_s == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.slow

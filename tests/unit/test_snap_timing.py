@@ -1,0 +1,119 @@
+"""A path that is timed anew is the same path, keeps every limit, and takes hardly longer than the least time that there is."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from firmware_py.core.rotations import from_euler
+from firmware_py.description.vehicle import load_vehicle
+from firmware_py.prepare.assembly import assemble_vehicle
+from firmware_py.prepare.minimum_snap import Limits, Waypoint, hasten, plan
+from firmware_py.prepare.piecewise import Piecewise
+from firmware_py.prepare.snap_timing import Timed, hastened
+
+SPEED, ACCELERATION = 0.3, 0.1
+LIMITS = Limits(np.full(3, SPEED / math.sqrt(3.0)), np.full(3, ACCELERATION), 0.1, 0.5, 0.5)
+SURVEY = [np.array([10.0 * (k % 4 in (1, 2)), k // 2, 2.0]) for k in range(5)]
+"""Lanes of 10 m, 1 m apart."""
+
+
+def timed(places: list[np.ndarray], yaws: list[float] | None = None) -> tuple[Piecewise, Timed]:
+    """The path through `places` as it was planned, and timed anew."""
+    yaws = yaws or [0.0] * len(places)
+    waypoints = [Waypoint(place, from_euler(0.0, 0.0, yaw)) for place, yaw in zip(places, yaws, strict=True)]
+    path = plan(waypoints, None, LIMITS)
+    return path, hasten(path, SPEED, waypoints, LIMITS)
+
+
+@pytest.fixture(scope="module")
+def survey() -> Piecewise:
+    return plan([Waypoint(place) for place in SURVEY], None, LIMITS)
+
+
+def motion(path: Piecewise) -> np.ndarray:
+    """(n, 19) p, q, v, w, a, alpha at many times."""
+    return np.array([np.concatenate(path.sample(t)) for t in np.linspace(0.0, path.duration_s, 4000)])
+
+
+def assert_within_limits(path: Piecewise) -> None:
+    x = motion(path)
+    assert np.linalg.norm(x[:, 7:10], axis=1).max() <= SPEED * (1.0 + 1e-4)
+    assert np.abs(x[:, 13:16]).max() <= ACCELERATION * (1.0 + 1e-3)
+    assert np.linalg.norm(x[:, 10:13], axis=1).max() <= 0.5 * (1.0 + 1e-4)
+    assert np.linalg.norm(x[:, 16:19], axis=1).max() <= 0.5 * (1.0 + 1e-3)
+    np.testing.assert_allclose(x[[0, -1], 7:], 0.0, atol=1e-9, err_msg="at rest at both ends")
+
+
+@pytest.mark.parametrize("length_m", [0.05, 1.0, 5.0, 100.0])
+def test_straight_line_takes_hardly_longer_than_full_acceleration_full_speed_and_full_braking(length_m: float) -> None:
+    """The least time: of a trapezoid of speed, or of a triangle where the way is too short for full speed. No motion beats it."""
+    _, found = timed([np.array([0.0, 0.0, 1.0]), np.array([length_m, 0.0, 1.0])])
+    top = min(SPEED, math.sqrt(ACCELERATION * length_m))
+    least_s = length_m / top + top / ACCELERATION
+    assert_within_limits(found.path)
+    assert least_s < found.path.duration_s < 1.02 * least_s + 4.0
+
+
+def test_diagonal_is_flown_at_the_speed_itself_not_at_its_share_along_each_axis() -> None:
+    _, found = timed([np.array([0.0, 0.0, 5.0]), np.array([20.0, 20.0, 25.0])])
+    speeds = np.linalg.norm(motion(found.path)[:, 7:10], axis=1)
+    assert_within_limits(found.path)
+    assert np.median(speeds) > 0.97 * SPEED
+
+
+def test_survey_takes_less_than_half_the_time_on_the_same_path() -> None:
+    """Regression: a run of places without a stop was slower than one that stopped at each of them."""
+    path, found = timed(SURVEY, [0.3 * k for k in range(len(SURVEY))])
+    assert_within_limits(found.path)
+    assert found.path.duration_s < 0.5 * path.duration_s
+    assert found.at_s[0] == 0.0 and found.at_s[-1] == pytest.approx(found.path.duration_s)
+    for place, before_s, at_s in zip(SURVEY, path.breaks, found.at_s, strict=True):
+        now, before = found.path.sample(at_s), path.sample(before_s)
+        np.testing.assert_allclose(now.p_wb, place, atol=1e-9)
+        np.testing.assert_allclose(now.q_wb, before.q_wb, atol=1e-9)
+    for k, (a, b) in enumerate(itertools.pairwise(SURVEY)):
+        legs = [np.array([p.sample(t).p_wb for t in np.linspace(*times[k : k + 2], 300)]) for p, times in ((path, path.breaks), found)]
+        along = (b - a) / np.linalg.norm(b - a)
+        was_off, is_off = (np.linalg.norm(leg - a - np.outer((leg - a) @ along, along), axis=1).max() for leg in legs)
+        assert is_off < was_off + 0.002
+
+
+def test_turn_on_the_spot_is_timed_too() -> None:
+    path, found = timed([np.zeros(3), np.zeros(3)], [0.0, 2.0])
+    assert_within_limits(found.path)
+    assert 2.0 / 0.5 + 0.5 / 0.5 < found.path.duration_s <= path.duration_s
+
+
+@pytest.mark.parametrize("slower_than", [1.0, 1.5, 3.0])
+def test_path_is_slowed_no_more_than_the_robot_needs(survey: Piecewise, slower_than: float) -> None:
+    """A robot that flies only paths that take a given time or longer."""
+    fastest = hastened(survey, SPEED, LIMITS, lambda found: True).path.duration_s
+    found = hastened(survey, SPEED, LIMITS, lambda found: found.duration_s >= slower_than * fastest)
+    if slower_than * fastest > survey.duration_s:
+        assert found.path is survey and found.at_s is survey.breaks
+    else:
+        assert slower_than * fastest <= found.path.duration_s < 1.03 * slower_than * fastest
+
+
+def test_robot_that_can_fly_nothing_faster_keeps_its_path(survey: Piecewise) -> None:
+    found = hastened(survey, SPEED, LIMITS, lambda found: False)
+    assert found.path is survey and found.at_s is survey.breaks
+
+
+def test_thrusters_of_a_real_robot_bound_the_pace() -> None:
+    """At 1.5 m/s a module needs more thrust than a fifth of its thrusters' range."""
+    body, fast = assemble_vehicle(load_vehicle("modcube")), 1.5
+    limits = Limits(np.full(3, fast), np.full(3, 1.0), 0.5, 0.5, 0.5, thruster_share=0.2)
+    waypoints = [Waypoint(np.array([x, 0.0, 5.0])) for x in (0.0, 20.0)]
+    path = plan(waypoints, None, limits, body)
+    found = hasten(path, fast, waypoints, limits, body)
+    assert found.path.duration_s < path.duration_s
+    assert np.linalg.norm(motion(found.path)[:, 7:10], axis=1).max() < 0.9 * fast
+
+
+def test_same_path_is_timed_the_same_to_the_byte(survey: Piecewise) -> None:
+    first, second = (hastened(survey, SPEED, LIMITS, lambda found: True) for _ in range(2))
+    assert first.path.coefficients.tobytes() == second.path.coefficients.tobytes()
+    assert first.path.breaks.tobytes() == second.path.breaks.tobytes()
