@@ -97,7 +97,7 @@ ROWS = (
         says_in=_all_but("MANUAL", "MOTOR_DETECT", DOCK),  # a magnet that pulls at another body pushes as well
     ),
     Row("30 % of the frames lost", "as before; 30 mm", _fault("frame_loss", 0.3), error_m=0.030),
-    Row("frames 20 ms late", "as before; 30 mm", _fault("frame_delay", 20.0), error_m=0.030),
+    Row("frames 20 ms late", "warns; 30 mm", _fault("frame_delay", 20.0), error_m=0.030, says="a module answers too late"),
     Row("30 % of the frames twice", "as before; 20 mm", _fault("frame_duplicate", 0.3), error_m=0.020),
     Row("10 % of the frames corrupt", "as before; 30 mm", _fault("frame_corrupt", 0.1), error_m=0.030),
     Row("node babbles", "as before; 20 mm", _fault("babble", 5.0), error_m=0.020),

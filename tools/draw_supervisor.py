@@ -34,6 +34,8 @@ WATCHED = """\
 - `module_silent`: no frame of a module comes, or it reports that it obeys no commands (BOOT, TIMEOUT or FAULT in MCU_STATUS).
   While every module of a body reports so, its path waits and its set-point rests where the body is: it does not swim back by itself
   afterwards.
+- `module_late`: MCU_STATUS comes, but for `ARM_ANSWER_MS` none has come in its own tick. The robot flies on; what it loses by that is in
+  [mcu.md](mcu.md).
 - `thruster_lost`: a thruster is left out because its ESC failed, or because it stands still, does not obey, or does not push as it says
   (`faults.*`). It is used again once the body is disarmed, its failed ESC has been well for a second, or the robot is pushed as much
   without it, so that it was not the cause. Thrusters that are left out with their silent module do not count.

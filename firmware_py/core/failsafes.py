@@ -93,6 +93,7 @@ TABLE = (
     Row("depth_lost", "no pressure", "depth_age_s", LASTS),
     Row("imu_lost", "no IMU", "imu_age_s", LASTS),
     Row("module_silent", "a module is silent", "silent_s", LASTS),
+    Row("module_late", "a module answers too late, or for another tick", "any_late"),
     Row("estop_box_silent", "e-stop box silent", "estop_box_age_s", LASTS),
     Row("ticks_missed", "ticks missed", "missed_ticks_per_s", ": {:.0f} in a second"),
     Row("fence", "outside the fence", "outside_m", " by {:.2f} m", modes=MOVING, forced_modes=frozenset({Mode.ALT_HOLD})),

@@ -132,6 +132,11 @@ class Health(NamedTuple):
         return f"modules {first.target_module} and {first.module} do not hold together{others}"
 
     @property
+    def any_late(self) -> bool:
+        """Whether any module answers too late, or for another tick."""
+        return len(self.late) > 0
+
+    @property
     def thruster_lost(self) -> bool:
         """Whether any thruster counts as dead or lying."""
         return len(self.dead) > 0

@@ -163,6 +163,11 @@ class Failsafes:
     module_silent_delay_s: float = delay(0.0, "FS_MOD_S")
     module_silent_action: int = action(2, "FS_MOD_ACT")
     module_silent_latched: int = latched(0, "FS_MOD_LAT")
+    # a module is heard, but for ARM_ANSWER_MS no MCU_STATUS came in its own tick: its bus delays frames, or its board is slow. The delay
+    # outlasts old frames that a bus brings at once when it is back
+    module_late_delay_s: float = delay(0.5, "FS_LATE_S")
+    module_late_action: int = action(1, "FS_LATE_ACT")
+    module_late_latched: int = latched(0, "FS_LATE_LAT")
     # the e-stop box is unplugged or dead: nobody could stop the robot with it. The limit is ten of its HEARTBEATs, so that a bus that loses
     # a third of its frames does not raise it
     estop_box_silent_limit: float = quantity(

@@ -18,15 +18,15 @@ FIELDS: dict[str, str] = {
     "cabin_hot": "cabin_c", "cabin_pressure": "cabin_change_pa", "axis_lost": "lost_axes", "depth_unknown": "",
     "tag_gone": "tag_age_s", "partner_lost": "open_joints", "estimator": "nis_ratio", "rejected": "rejected_share",
     "tag_lost": "tag_age_s", "pushed": "push_m_s", "tag_late": "tag_age_s",
-    "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s", "estop_box_silent": "estop_box_age_s",
-    "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "collision": "collision_s", "ground_lost": "ground_age_s",
-    "pilot_lost": "pilot_age_s",
+    "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "module_silent": "silent_s", "module_late": "late",
+    "estop_box_silent": "estop_box_age_s", "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "collision": "collision_s",
+    "ground_lost": "ground_age_s", "pilot_lost": "pilot_age_s",
     "thruster_lost": "dead", "cabin_unknown": "cabin_age_s", "battery_unknown": "battery_age_s", "battery_low": "voltage_share",
 }  # fmt: skip
 """Field of Health that each fail-safe judges; depth_unknown and pushed judge two (see `spoilt`)."""
 YES: dict[str, Any] = {
     "leak": True, "foreign_sync": True, "foreign_command": True, "axis_lost": 1,
-    "partner_lost": (DockRequest(0, 0, 1, 1),), "thruster_lost": (3,),
+    "partner_lost": (DockRequest(0, 0, 1, 1),), "thruster_lost": (3,), "module_late": (1,),
 }  # fmt: skip
 WORDS = {
     "leak": "water in a cabin",
@@ -48,6 +48,7 @@ WORDS = {
     "depth_lost": "no pressure for 1.0 s",
     "imu_lost": "no IMU for 0.5 s",
     "module_silent": "a module is silent for 0.5 s",
+    "module_late": "a module answers too late, or for another tick",
     "estop_box_silent": "e-stop box silent for 5.0 s",
     "ticks_missed": "ticks missed: 5 in a second",
     "fence": "outside the fence by 0.05 m",
