@@ -345,6 +345,17 @@ def test_picture_counts_whose_tags_come_in_different_ticks(row: Row, late: int, 
     assert bank.status(0).position == found
 
 
+def test_picture_of_many_tags_is_kept_once(row: Row) -> None:
+    """Eight tags of the early module in each picture do not push out those that wait 80 ms for the late one."""
+    bank, waiting = PairBank(ROW[:1], P), list[list[TagObservation]]()
+    for _ in range(150):
+        time_ns, modules = row.hear()
+        waiting.append(modules[1].tags)
+        modules[0].tags, modules[1].tags = 8 * modules[0].tags, waiting.pop(0) if len(waiting) > 8 else []
+        bank.step(time_ns, modules, row.seen(modules))
+    assert bank.status(0).position
+
+
 def test_picture_is_counted_once(row: Row) -> None:
     """A second tag of a module in a picture that was used, and pictures that stay the newest ones, change nothing."""
     bank = PairBank(ROW[:1], P)
