@@ -22,8 +22,8 @@ BROKEN_NS = 5_000_000_000
 """How long a DISARM of a body that came apart by itself stops all its pieces: a person who sees it break means the whole, and takes a few
 seconds (synthetic) to see it and to act."""
 PARTED_NS = 3_000_000_000
-"""How long the two pieces of an undock are no obstacles to each other: pushed off by the magnets, one swings back towards the other 1.3 s
-later, at 0.1 m/s (measured in dock-undock-dock), before they glide to their places."""
+"""How long the two pieces of an undock are no obstacles to each other: pushed off by the magnets, one swings back towards the other 0.4 s
+later, at 0.07 m/s (measured in dock-undock-dock), before they glide to their places."""
 
 
 class Formation:

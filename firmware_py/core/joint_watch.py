@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import numpy as np
 
 from firmware_py.core.docking_detector import ModulePoses, PairBank
-from firmware_py.core.docking_pairs import CURRENT
+from firmware_py.core.docking_pairs import CLOSED, CURRENT
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.types import NEVER_NS, DockRequest, ModuleInputs
 from firmware_py.description.parameters import Docking
@@ -50,12 +50,12 @@ class JointWatch:
         return self._bank.rows.copy()
 
     def open_joints(self, least: int) -> list[DockRequest]:
-        """Joints that should hold but are at least `least` (LOOSE or APART), as requests that name their faces."""
+        """Joints that should hold but are at least `least` (any for CLOSED), as requests that name their faces."""
         return [self._joints[k].request for k in np.flatnonzero(self._bank.rows["open"] >= least).tolist()] if self._joints else []
 
-    def existing(self, requests: Sequence[DockRequest]) -> list[DockRequest]:
-        """The requests whose joints still exist."""
-        there = [modules_of(joint.request) for joint in self._joints]
+    def existing(self, requests: Sequence[DockRequest], least: int = CLOSED) -> list[DockRequest]:
+        """The requests whose joints still exist and are at least `least` (CLOSED, LOOSE or APART)."""
+        there = list(map(modules_of, self.open_joints(least)))
         return [request for request in requests if modules_of(request) in there]
 
     def newest_ns(self, request: DockRequest, what: str) -> int:

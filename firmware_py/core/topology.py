@@ -17,8 +17,8 @@ from firmware_py.core.rotations import conjugate, cross, multiply, normalise, ro
 JOINED_SIGMA = (0.003, 0.01, 0.01, 0.03)
 """Added to a joined body's sigma: position m, attitude rad, velocity m/s, rate rad/s. Covers the play of the faces, and the shock."""
 PARTED_SIGMA = (0.07, 0.05, 0.07, 0.1)
-"""The same for a parted body: magnets push the pieces apart for up to a second (`release_s`) before they are flown as two. On the bench
-each has by then moved 70 mm and 0.05 rad, at 70 mm/s and 0.1 rad/s (dock-undock-dock, seed 1)."""
+"""The same for a parted body: magnets push the pieces apart before they are flown as two. On the bench each has by then moved 35 mm and
+0.02 rad, at 80 mm/s and 0.1 rad/s (dock-undock-dock, seed 1), and twice as far where the push takes all of its second (`release_s`)."""
 DEPTH_BIAS_SPREAD_M = 0.02
 BIAS_SPREAD = np.repeat([0.005, 0.05, DEPTH_BIAS_SPREAD_M], [3, 3, 1])
 """(7,) sigma of the biases of gyro, rad/s, accelerometer, m/s^2, and depth, m, between modules (synthetic, as the bench draws

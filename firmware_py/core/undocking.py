@@ -1,4 +1,4 @@
-"""One undock under way: its magnets push, then pictures, or else currents, show whether its joints have opened."""
+"""One undock under way: its magnets push until its joints are seen open, or else pictures and currents are asked whether one holds."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_plan import UndockPlan
 from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.types import DockRequest
@@ -39,7 +40,11 @@ class Undock(NamedTuple):
         return Undock(plan, pipelines, time_ns, time_ns + push_ns, time_ns + seen_ns, last_ns, before_ma)
 
     def pushes(self, time_ns: int, joints: JointWatch) -> bool:
-        """Whether it is too early to call `held_by`: a single joint waits for a picture, several joints for their currents."""
+        """Whether it is too early to call `held_by`: a single joint waits for a picture, several joints for their currents. Joints that
+        are all APART have been pushed enough: until their body parts, its pieces are steered as one, each against what the other does.
+        """
+        if len(joints.existing(self.plan.opens, APART)) == len(self.plan.opens):
+            return False
         has_evidence = self._has_picture if len(self.plan.opens) == 1 else self._has_currents
         return time_ns < self.until_ns or (time_ns < self.seen_ns and not has_evidence(time_ns, joints))
 

@@ -303,7 +303,7 @@ class Docking:
         unit="s",
         low=0.01,
         high=60,
-        help="time that magnets push apart after a jam or to undock; an undock waits longer for late readings",
+        help="time that magnets push apart after a jam or to undock; an undock ends once its joints are open, and waits for late readings",
         mavlink="DOCK_RELEASE",
     )
     sigma_m: float = quantity(

@@ -69,9 +69,7 @@ def test_dock_of_two_modules_is_replayed_to_the_byte(twice: Flown) -> None:
 
 @pytest.mark.slow
 def test_both_pieces_know_where_they_are_from_the_first_pictures_after_an_undock(twice: Flown) -> None:
-    """By then the magnets have pushed them apart for most of a second, while the firmware still took them for one body. One swings back
-    towards the other, which is no collision.
-    """
+    """By then the magnets have pushed them apart for half a second, while the firmware still took them for one body."""
     believed = read_signals(twice.folder / "signals.mcap")
     truth = read_signals(twice.folder / "truth.mcap")
     times = believed["/firmware/body1"]["time_ns"]
@@ -84,6 +82,23 @@ def test_both_pieces_know_where_they_are_from_the_first_pictures_after_an_undock
         assert 0.0005 < np.sqrt(np.mean(error_m[(since_s > 0.1) & (since_s < 1.5)] ** 2)) < 0.006
         refused = body["rejected"][i][(since_s >= 0.0) & (since_s < 1.5)]
         assert refused[-1] - refused[0] < 10
+
+
+@pytest.mark.slow
+def test_module_whose_thruster_is_stuck_is_undocked_without_a_tumble(fly: Fly, tmp_path: Path) -> None:
+    """Regression: for a second after their joint had opened, the two were steered as one body. The healthy module held against the stuck
+    thruster of the other one, which nothing held any more: they tumbled by 85 degrees and struck each other.
+    """
+    scenario = load_scenario("mobius-2")
+    fault = Fault(kind="thruster_stuck", module=2, index=5, value=0.5, at_s=4.0)
+    steps = Step(do="undock", module=2, face="-x", target_module=1, target_face="+x"), Step(do="wait", duration_s=2.0)
+    task = dataclasses.replace(scenario.task, kind="dock", settle_s=6.0, duration_s=20.0)
+    fly(dataclasses.replace(scenario, task=task, step=steps, fault=(fault,)), 0)
+    truth = [read_signals(tmp_path / "run" / "truth.mcap")[f"/plant/module{m}"] for m in range(2)]
+    places, attitudes = ([module[name] for module in truth] for name in ("p_wm", "q_wm"))
+    assert np.linalg.norm(places[0][-1] - places[1][-1]) > PITCH_M + 0.1
+    tilts = [2.0 * np.arcsin(np.hypot(*q_wm[:, 1:3].T)) for q_wm in attitudes]
+    assert np.degrees(np.max(tilts)) < 35.0
 
 
 @pytest.mark.slow
