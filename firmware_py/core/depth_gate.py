@@ -51,11 +51,7 @@ the edge of the gate has every other reading refused, and no near one."""
 
 
 class DepthGate:
-    """Judges the pressure sensors of one body's modules.
-
-    Attributes:
-        heard: whether any pressure reading was left in this tick.
-    """
+    """Judges the pressure sensors of one body's modules."""
 
     def __init__(self, body: Body) -> None:
         self._most_pa = 1.1 * ATMOSPHERE_PA + MOST_RATING * body.depth_rating_m * PA_PER_M
@@ -64,7 +60,6 @@ class DepthGate:
         """(m, 3) places of the sensors, in the order of `_sensors`."""
         self._spread_m = DEPTH_BIAS_SPREAD_M * math.sqrt(1.0 - 1.0 / len(body.modules))
         """Sigma of a sensor's bias less the mean of all."""
-        self.heard = False
 
     def take_over(self, before: Sequence[DepthGate]) -> None:
         """Takes over what the previous bodies knew of the modules' sensors."""
@@ -90,7 +85,7 @@ class DepthGate:
             armed: whether the body flies; while it does not, a sensor that was trusted may take on any offset, as in another tank, and the
                 body may fall into the water.
         """
-        self.heard, believed = False, list(modules)
+        believed = list(modules)
         below_m = self._r_bi.dot(LEVEL if expected is None else expected.down_b).tolist()
         for k, (index, sensor) in enumerate(self._sensors.items()):
             pressure_pa = modules[index].pressure_pa
@@ -98,7 +93,6 @@ class DepthGate:
                 continue
             is_possible = LEAST_PA <= pressure_pa <= self._most_pa
             passed = is_possible and sensor.passes(time_ns, pressure_pa, expected, below_m[k], self._spread_m, armed)
-            self.heard = self.heard or passed
             if not passed or sensor.offset_m:
                 corrected_pa = pressure_pa - sensor.offset_m * PA_PER_M if passed else None
                 believed[index] = dataclasses.replace(modules[index], pressure_pa=corrected_pa)

@@ -92,6 +92,7 @@ TABLE = (
     Row("tag_late", "no tag", "tag_age_s", LASTS, modes=MOVING),
     Row("depth_lost", "no pressure", "depth_age_s", LASTS),
     Row("imu_lost", "no IMU", "imu_age_s", LASTS),
+    Row("sensor_lost", "a module of several has no IMU or no pressure", "sensor_age_s", LASTS),
     Row("module_silent", "a module is silent", "silent_s", LASTS),
     Row("module_late", "a module answers too late, or for another tick", "any_late"),
     Row("estop_box_silent", "e-stop box silent", "estop_box_age_s", LASTS),

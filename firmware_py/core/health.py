@@ -97,6 +97,10 @@ class Health(NamedTuple):
     """Those of `silent` from which an MCU_STATUS came lately, but of another tick than the one in which it came."""
     still_s: float = 0.0
     """How long every module has reported that it obeys no commands, so that all thrusters stand still. One that is only silent may obey."""
+    sensor_age_s: float = math.nan
+    """Age of the latest trusted IMU sample, or pressure where a sensor was heard, of the module where it is oldest; NaN for a body of one
+    module, whose ages are those above.
+    """
     estop_box_age_s: float = math.nan
     """NaN before an e-stop box was heard."""
 

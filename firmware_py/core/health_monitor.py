@@ -49,9 +49,6 @@ class _Latest:
 
     time_ns: int = NEVER_NS
     """Time of the last tick."""
-    imu_ns: int = NEVER_NS
-    depth_ns: int = NEVER_NS
-    depth_heard: bool = False
     ready_ns: int = NEVER_NS
     """When an attitude was last known."""
     foreign_sync_ns: int = NEVER_NS
@@ -72,8 +69,8 @@ class PerModule:
     def __init__(self, modules: Sequence[int]) -> None:
         never = dict.fromkeys(modules, NEVER_NS)
         self.heard_ns, self.hears_ns, self.answered_ns, self.late_ns = (never.copy() for _ in range(4))
-        self.battery_ns, self.cabin_ns, self.wet_ns = (never.copy() for _ in range(3))
-        self.unfit, self.leak, self.wet = (dict.fromkeys(modules, False) for _ in range(3))
+        self.imu_ns, self.pressure_ns, self.battery_ns, self.cabin_ns, self.wet_ns = (never.copy() for _ in range(5))
+        self.has_pressure, self.unfit, self.leak, self.wet = (dict.fromkeys(modules, False) for _ in range(4))
         self.voltage_share, self.cabin_c, self.cabin_start_pa, self.cabin_change_pa = (dict[int, float]() for _ in range(4))
 
     def take_over(self, other: PerModule) -> None:
@@ -104,10 +101,8 @@ class HealthMonitor:
         self._rejected, self._tag_ns = 0, NEVER_NS
         self._pictures_ns = (NEVER_NS, NEVER_NS)
         self.now: Health
-        self.imu_heard = True
-        """Whether a trusted IMU was heard in this tick; set by the code that watches the sensors."""
-        self.pressure_heard = False
-        """The same for a pressure sensor."""
+        self.believed: Sequence[ModuleInputs] = ()
+        """Inputs of the fleet's modules in this tick, without samples that are not trusted; set by the code that watches the sensors."""
         self.open_joints: tuple[DockRequest, ...] = ()
         """Set by the code that watches the docked faces."""
         self.collision_s = math.nan
@@ -123,7 +118,11 @@ class HealthMonitor:
         self._esc_fresh_ns = round(parameters.supervision.esc_fresh_ms * 1e6)
 
     def take_over(self, before: Sequence[HealthMonitor]) -> None:
-        """Inherits from the bodies that this one is made of, or was part of: the last reports of each module, and `_Latest`."""
+        """Inherits from the bodies that this one is made of, or was part of: the last reports of each module, what was believed of it in
+        this tick, and `_Latest`.
+        """
+        believed = {module: other.believed[module] for other in before if other.believed for module in other._reports.heard_ns}
+        self.believed = [believed.get(module, said) for module, said in enumerate(before[0].believed)]
         for other in before:
             self._stopped_ns |= other._stopped_ns
             self._unknown_esc_ns |= {at: ns for at, ns in other._unknown_esc_ns.items() if at.module in self._thruster_at}
@@ -137,15 +136,11 @@ class HealthMonitor:
         """Returns the figures of this tick, and stores them in `now`."""
         now, latest = inputs.time_ns, self._latest
         if latest.time_ns == NEVER_NS:  # first tick: silence counts from here
-            latest.time_ns = latest.depth_ns = latest.imu_ns = latest.ready_ns = now
-            for heard_ns in (self._reports.heard_ns, self._reports.hears_ns):
+            latest.time_ns = latest.ready_ns = now
+            for heard_ns in (self._reports.heard_ns, self._reports.hears_ns, self._reports.imu_ns, self._reports.pressure_ns):
                 heard_ns.update(dict.fromkeys(heard_ns, now))
         self._listen(inputs.modules, now)
         self._hear_stops(inputs.modules, now)
-        if self.imu_heard:
-            latest.imu_ns = now
-        if self.pressure_heard:
-            latest.depth_ns, latest.depth_heard = now, True
         if estimate.ready:
             latest.ready_ns = now
         if inputs.foreign_sync:
@@ -173,9 +168,10 @@ class HealthMonitor:
             sigma_m=max(estimate.sigma_p.tolist()),
             nis_ratio=self._nis_ratio,
             rejected_share=self._rejected_share,
-            depth_age_s=(now - latest.depth_ns) * 1e-9,
-            depth_heard=latest.depth_heard,
-            imu_age_s=(now - latest.imu_ns) * 1e-9,
+            depth_age_s=(now - max(self._reports.pressure_ns.values())) * 1e-9,
+            depth_heard=any(self._reports.has_pressure.values()),
+            imu_age_s=(now - max(self._reports.imu_ns.values())) * 1e-9,
+            sensor_age_s=self._sensor_age_s(now),
             voltage_share=min(self._reports.voltage_share.values(), default=math.nan),
             leak=any(self._reports.leak.values()),
             cabin_c=max(self._reports.cabin_c.values(), default=math.nan),
@@ -224,6 +220,11 @@ class HealthMonitor:
                     self._reports.late_ns[index] = now
             if self._reports.heard_ns[index] == now and not self._reports.unfit[index]:
                 self._reports.hears_ns[index] = now
+            believed = self.believed[index]
+            if believed.gyro is not None and believed.accel is not None:
+                self._reports.imu_ns[index] = now
+            if believed.pressure_pa is not None:
+                self._reports.pressure_ns[index], self._reports.has_pressure[index] = now, True
             for tag in module.tags:
                 if tag.capture_ns > self._pictures_ns[1]:
                     self._pictures_ns = self._pictures_ns[1], tag.capture_ns
@@ -252,6 +253,10 @@ class HealthMonitor:
                 self._stopped_ns[index] = now
             elif module.mcu_state is not None:
                 self._stopped_ns.pop(index, None)
+
+    def _sensor_age_s(self, now: int) -> float:
+        pressures_ns = [at for m, at in self._reports.pressure_ns.items() if self._reports.has_pressure[m]]
+        return (now - min(*self._reports.imu_ns.values(), *pressures_ns)) * 1e-9 if len(self._reports.imu_ns) > 1 else math.nan
 
     def _tag_gap_s(self, now: int) -> float:
         """Returns the time between the last two tag pictures; NaN once the next one is overdue (twice that time)."""

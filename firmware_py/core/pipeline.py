@@ -105,8 +105,7 @@ class BodyPipeline:
         if self.sensors.pressure_heard:
             expected = self.estimator.expected_depth(inputs.time_ns)
             believed = self.depth_gate.step(inputs.time_ns, believed, expected, self.supervisor.armed)
-        self.health.imu_heard = self.sensors.imu_heard
-        self.health.pressure_heard = self.sensors.pressure_heard and self.depth_gate.heard
+        self.health.believed = believed
         measured = self.measurements.fuse(believed, self.estimator.q_wb)
         estimate = self.estimator.step(inputs.time_ns, measured, self.body.thrusters.matrix.dot(mean_n))
         self.depth_gate.compare(self.estimator.fused)

@@ -39,12 +39,12 @@ class SensorWatch:
     """Watches the sensors of one body's modules.
 
     Attributes:
-        imu_heard, pressure_heard: whether any IMU, or any pressure sensor, gave a plausible sample in this tick.
+        pressure_heard: whether any pressure sensor gave a plausible sample in this tick.
     """
 
     def __init__(self, modules: Sequence[int]) -> None:
         self._watches = {module: _ModuleWatch() for module in modules}
-        self.imu_heard = self.pressure_heard = False
+        self.pressure_heard = False
 
     def take_over(self, before: Sequence[SensorWatch]) -> None:
         """Takes over the watches of the body's modules from the previous bodies."""
@@ -54,10 +54,9 @@ class SensorWatch:
     def step(self, modules: Sequence[ModuleInputs]) -> Sequence[ModuleInputs]:
         """The inputs of the fleet, by fleet index, without the implausible samples of this body's modules."""
         believed = list(modules)
-        self.imu_heard = self.pressure_heard = False
+        self.pressure_heard = False
         for index, watch in self._watches.items():
             module = believed[index] = watch.step(modules[index])
-            self.imu_heard = self.imu_heard or (module.gyro is not None and module.accel is not None)
             self.pressure_heard = self.pressure_heard or module.pressure_pa is not None
         return believed
 

@@ -155,6 +155,15 @@ class Failsafes:
     imu_lost_delay_s: float = delay(0.0, "FS_IMU_S")
     imu_lost_action: int = action(2, "FS_IMU_ACT")
     imu_lost_latched: int = latched(0, "FS_IMU_LAT")
+    # a module of several has lost its IMU or pressure sensor: the body flies on with those of the others, the module alone could not
+    sensor_lost_limit: float = quantity(
+        1.0, unit="s", low=0.1, high=60,
+        help="longest permitted time without a trusted IMU sample or pressure of a single module, in a body of several",
+        mavlink="FS_SENS_LIM",
+    )
+    sensor_lost_delay_s: float = delay(0.0, "FS_SENS_S")
+    sensor_lost_action: int = action(1, "FS_SENS_ACT")
+    sensor_lost_latched: int = latched(0, "FS_SENS_LAT")
     # a CAN node is silent, or obeys no commands
     module_silent_limit: float = quantity(
         0.5, unit="s", low=0.1, high=60,

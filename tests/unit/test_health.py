@@ -65,7 +65,7 @@ class MonitorBench:
             np.full(3, 0.002), 30_000_000, 6.0, 6, 0, True,
         )  # fmt: skip
         estimate = estimate._replace(**{k: v for k, v in more.items() if k in Estimate._fields})  # type: ignore[arg-type]
-        self.monitor.pressure_heard = any(module.pressure_pa is not None for module in (modules[1], modules[3]))
+        self.monitor.believed = modules
         inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped, **self.foreign)
         faults = ThrusterFaults(np.ones(self.count, dtype=bool), (), 0, np.eye(6), np.ones(2))
         return self.monitor.step(inputs, estimate, list(requests), faults)
@@ -453,12 +453,36 @@ def test_depth_counts_as_unknown_while_there_is_no_estimate_to_use_it() -> None:
 
 
 def test_imu_is_as_old_as_its_last_sample_that_was_believed() -> None:
+    bench, well = MonitorBench(), here(gyro=ZERO, accel=ZERO)
+    assert bench.wait(0.5, one=well).imu_age_s == 0.0
+    assert bench.wait(0.3, one=here(gyro=ZERO), three=here(accel=ZERO)).imu_age_s == pytest.approx(0.3), "half an IMU is none"
+    assert bench.step(None, well).imu_age_s == 0.0
+
+
+def test_sensors_of_a_body_of_several_are_as_old_as_those_of_the_module_where_they_are_oldest() -> None:
+    """A pressure sensor that was never heard may not be there; an IMU is in every module."""
+    bench, imu = MonitorBench(), {"gyro": ZERO, "accel": ZERO}
+    bench.step()
+    health = bench.wait(0.5, one=here(pressure_pa=1.1e5, **imu), three=here(**imu))
+    assert health.sensor_age_s == 0.0
+    assert bench.wait(0.5, one=here(**imu), three=here(**imu)).sensor_age_s == pytest.approx(0.5)
+    bench.step(here(pressure_pa=1.1e5, **imu), here(**imu))
+    health = bench.wait(0.7, one=here(pressure_pa=1.1e5, **imu), three=here(pressure_pa=1.1e5))
+    assert health.sensor_age_s == pytest.approx(0.7) and health.imu_age_s == health.depth_age_s == 0.0
+    part = HealthMonitor(SINGLE, Parameters(), TICK_NS)
+    part.take_over([bench.monitor])
+    bench.monitor = part
+    assert math.isnan(bench.step().sensor_age_s), "a module alone has its own ages"
+
+
+def test_module_that_leaves_without_an_imu_of_its_own_is_known_to_have_none() -> None:
     bench = MonitorBench()
-    assert bench.wait(0.5).imu_age_s == 0.0
-    bench.monitor.imu_heard = False
-    assert bench.wait(0.3).imu_age_s == pytest.approx(0.3)
-    bench.monitor.imu_heard = True
-    assert bench.step().imu_age_s == 0.0
+    bench.step()
+    bench.wait(0.7, one=here(gyro=ZERO, accel=ZERO), three=here())
+    part = HealthMonitor(assemble([(0, 0, 0)], [0], [MODCUBE], [3]), Parameters(), TICK_NS)
+    part.take_over([bench.monitor])
+    bench.monitor = part
+    assert bench.step().imu_age_s == pytest.approx(0.71)
 
 
 def test_robot_that_stands_by_gravity_alone_is_nowhere_but_ready() -> None:
