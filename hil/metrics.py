@@ -53,7 +53,7 @@ SHOWN = {
     "thrust_rate_rms_n_s": Shown("Thruster command, rate of change, RMS", "N/s"),
     "supply_power_w": Shown("Electrical power of all modules, mean", "W"),
     "wrench_margin_min": Shown("Thrust reserve, worst thruster and tick", "%", 100.0, 1, low=-math.inf),
-    "tags_rejected": Shown("Tag observations rejected by the gate", digits=0),
+    "tags_rejected": Shown("Tag observations refused by the estimator", digits=0),
     "armed_share": Shown("Time armed, share of the judged part", "%", 100.0, 1, high=1.0),
     "docked": Shown("Docked and undocked as asked", words=("no", "yes"), high=1.0),
     "gap_min_m": Shown("Gap between facing faces, smallest", "mm", 1e3, low=-math.inf),

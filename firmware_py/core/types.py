@@ -273,7 +273,7 @@ class Estimate(NamedTuple):
     nis_dof: int
     """Degrees of freedom of `nis`."""
     rejected: int
-    """Number of tag observations rejected by the gate so far."""
+    """Number of tag observations refused so far: beyond the gate, older than one that was fused, against gravity, or not finite."""
     ready: bool
     """Whether an attitude has been found: by tags, or by gravity before the first tag."""
     starts: int = 0
