@@ -14,6 +14,7 @@ from firmware_py.ground.mission_flight import Plan, PlanJob
 from firmware_py.ground.mission_legs import GO_TO, Leg
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, distinct, hasten, plan
 from firmware_py.prepare.piecewise import Piecewise
+from firmware_py.prepare.snap_timing import MOVED_M
 
 _SAME = 1e-3
 """Largest difference, in position (m) and in quaternion, at which neighbouring waypoints count as one."""
@@ -21,8 +22,6 @@ _ANGULAR_RATE, _ANGULAR_ACCELERATION = 0.5, 0.5
 """rad/s and rad/s^2. Turns on the way are gentle, so that the tag stays readable."""
 _LEAST_SHARE = 1e-3
 """Least share of a speed that is permitted along an axis: an axis that does not move needs a limit above zero too."""
-_MOVED_M = 0.002
-"""By how much a path may move when its timing changes: its corridor is narrower by so much before."""
 _THRUSTER_SHARE = 0.6
 """Share of each thruster's range that a mission may use; the rest is reserved against the current."""
 
@@ -118,7 +117,7 @@ def _limits(job: PlanJob, velocity: np.ndarray) -> Limits:
     return Limits(
         velocity=velocity,
         acceleration=np.full(3, job.acceleration),
-        corridor_m=job.corridor_m - _MOVED_M,
+        corridor_m=job.corridor_m - MOVED_M,
         angular_rate=_ANGULAR_RATE,
         angular_acceleration=_ANGULAR_ACCELERATION,
         thruster_share=_THRUSTER_SHARE,

@@ -27,10 +27,16 @@ _LEAST_PACE, _GREATEST_PACE = 1e-3, 1e2
 _SHARES = (0.9, 0.7, 0.5)
 """Shares of the permitted accelerations that are tried: interpolation rounds the jumps of the pace, and overshoots where it does."""
 _KNOT_S = 1.0
-"""Time between places that are interpolated. With it the path moves by a millimetre; with 2.5 s by 40 mm."""
+"""Time between places that are interpolated. At 0.1 m/s^2 the path then moves by a millimetre, and by more where it bends more sharply."""
+MOVED_M = 0.002
+"""By how much the path may move."""
+_DENSER = 5
+"""How often places are put between those where the path has moved further: each halves the time between them."""
 _STEADY, _LONGEST = 0.02, 3
 """Share of the permitted acceleration below which a motion is steady. Of the places within it only every third is interpolated."""
 _CHECK_POINTS = 48
+_PROBES = 4
+"""Parts of a piece between which it is seen whether the path has moved."""
 _HALVINGS = 8
 """Steps in which the least slowing is found that the thrusters need: to less than a hundredth of the time that was gained."""
 
@@ -39,7 +45,7 @@ class Timed(NamedTuple):
     """A path with another timing.
 
     Attributes:
-        path: the same path, but for a millimetre or two.
+        path: the same path, within MOVED_M.
         at_s: (k + 1,) s, when it is at each of the breaks of the path before.
     """
 
@@ -109,6 +115,8 @@ def hastened(path: Piecewise, speed_m_s: float, limits: Limits, is_flyable: Call
         for share in _SHARES:
             eased = bounds._replace(speed=speed, acceleration=share * bounds.acceleration)
             timed = _interpolated(path, _fastest(path, eased), eased)
+            if timed is None:
+                continue
             timed = timed.slowed(bounds.stretch(timed.path))
             longest = best.path.duration_s / timed.path.duration_s
             if longest > 1.0:
@@ -167,20 +175,45 @@ def _fastest(path: Piecewise, bounds: _Bounds) -> _Pace:
     return _Pace(times, np.concatenate([[0.0], np.cumsum(2.0 * step / (pace[1:] + pace[:-1]))]), pace)
 
 
-def _interpolated(path: Piecewise, pace: _Pace, bounds: _Bounds) -> Timed:
-    """The minimum snap through places of the path, at the pace."""
+def _interpolated(path: Piecewise, pace: _Pace, bounds: _Bounds) -> Timed | None:
+    """The minimum snap through places of the path, at the pace; None where it would leave the path."""
     breaks = pace.new[np.searchsorted(pace.times, path.breaks)]
     counts = np.maximum(1, np.round(np.diff(breaks) / _KNOT_S)).astype(int)
     own = np.concatenate([[0], np.cumsum(counts)])
     knots = np.interp(np.arange(own[-1] + 1), own, breaks)
-    times = pace.times_at(knots)
-    keep = _worth_keeping(path, knots, times, own, bounds)
-    knots, poses = knots[keep], [path.sample(time) for time in times[keep].tolist()]
+    knots = knots[_worth_keeping(path, knots, pace.times_at(knots), own, bounds)]
+    for _ in range(_DENSER + 1):
+        found = _through(path, pace, knots)
+        has_moved = _moved(path, pace, found) > MOVED_M
+        if not has_moved.any():
+            return Timed(found, breaks)
+        knots = np.sort(np.concatenate([knots, 0.5 * (knots[1:] + knots[:-1])[has_moved]]))
+    return None
+
+
+def _through(path: Piecewise, pace: _Pace, knots: np.ndarray) -> Piecewise:
+    """The minimum snap through where the path is, at the pace, at the new times `knots`, s."""
+    poses = [path.sample(time) for time in pace.times_at(knots).tolist()]
     position, attitude = np.array([pose.p_wb for pose in poses]), np.array([pose.q_wb for pose in poses])
     attitude[1:] *= np.cumprod(np.where(np.sum(attitude[1:] * attitude[:-1], axis=1) < 0.0, -1.0, 1.0))[:, None]
     system = System.of(np.diff(knots))
     coefficients = [system.coefficients(value, solve(system, Knots.at_rest(value))) for value in (position, attitude)]
-    return Timed(Piecewise(np.ascontiguousarray(np.concatenate(coefficients, axis=2)), knots, "timed"), breaks)
+    return Piecewise(np.ascontiguousarray(np.concatenate(coefficients, axis=2)), knots, "timed")
+
+
+def _moved(path: Piecewise, pace: _Pace, found: Piecewise) -> np.ndarray:
+    """(n,) m, by how much each piece of `found` is off the path: ahead or behind on it does not count."""
+    shares = np.arange(_PROBES + 1) / _PROBES
+    times = pace.times_at(found.breaks[:-1, None] + np.diff(found.breaks)[:, None] * shares)
+    places, longest = found.grid(_PROBES)[..., :3].reshape(-1, 3), np.repeat(np.ptp(times, axis=1), _PROBES + 1)
+    motion = [path.sample(time) for time in times.ravel().tolist()]
+    velocity = np.array([point.v_w for point in motion])
+    off = places - np.array([point.p_wb for point in motion])
+    ahead = np.sum(off * velocity, axis=1) / np.maximum(np.sum(velocity**2, axis=1), np.finfo(float).tiny)
+    beside = times.ravel() + np.clip(ahead, -longest, longest)
+    nearer = places - np.array([path.sample(time).p_wb for time in beside.tolist()])
+    least = np.minimum(np.linalg.norm(off, axis=1), np.linalg.norm(nearer, axis=1))
+    return np.asarray(least.reshape(-1, _PROBES + 1).max(axis=1))
 
 
 def _worth_keeping(path: Piecewise, knots: np.ndarray, times: np.ndarray, own: np.ndarray, bounds: _Bounds) -> np.ndarray:

@@ -11,7 +11,7 @@ from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from firmware_py.prepare.minimum_snap import Limits, Waypoint, hasten, plan
 from firmware_py.prepare.piecewise import Piecewise
-from firmware_py.prepare.snap_timing import Timed, hastened
+from firmware_py.prepare.snap_timing import MOVED_M, Timed, hastened
 
 SPEED, ACCELERATION = 0.3, 0.1
 LIMITS = Limits(np.full(3, SPEED / math.sqrt(3.0)), np.full(3, ACCELERATION), 0.1, 0.5, 0.5)
@@ -78,6 +78,20 @@ def test_survey_takes_less_than_half_the_time_on_the_same_path() -> None:
         along = (b - a) / np.linalg.norm(b - a)
         was_off, is_off = (np.linalg.norm(leg - a - np.outer((leg - a) @ along, along), axis=1).max() for leg in legs)
         assert is_off < was_off + 0.002
+
+
+@pytest.mark.parametrize(("speed", "acceleration", "corridor_m"), [(1.0, 0.5, 0.2), (1.0, 2.0, 0.02), (2.0, 2.0, 0.2)])
+def test_path_stays_where_it_was_at_any_acceleration(speed: float, acceleration: float, corridor_m: float) -> None:
+    """Regression: at 2 m/s^2 it moved by 58 mm, and left a corridor of 20 mm by 24 mm."""
+    limits = Limits(np.full(3, speed / math.sqrt(3.0)), np.full(3, acceleration), corridor_m, 0.5, 0.5)
+    square = [Waypoint(np.array(place)) for place in ((0.0, 0.0, 3.0), (4.0, 0.0, 3.0), (4.0, 4.0, 3.0), (0.0, 4.0, 3.0))]
+    path = plan(square, None, limits)
+    found = hasten(path, speed, square, limits)
+    assert found.path.duration_s < 0.8 * path.duration_s
+    before, now = motion(path)[:, :3], motion(found.path)[::10, :3]
+    half_step_m = 0.5 * np.linalg.norm(np.diff(before, axis=0), axis=1).max()
+    for place in now:
+        assert np.linalg.norm(before - place, axis=1).min() < math.hypot(MOVED_M, half_step_m)
 
 
 def test_turn_on_the_spot_is_timed_too() -> None:
