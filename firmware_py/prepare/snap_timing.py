@@ -26,6 +26,8 @@ _LEAST_PACE, _GREATEST_PACE = 1e-3, 1e2
 """Bounds of the pace, times that of the path: at a rest nothing else bounds it."""
 _SHARES = (0.9, 0.7, 0.5)
 """Shares of the permitted accelerations that are tried: interpolation rounds the jumps of the pace, and overshoots where it does."""
+_RISE_S = 2.0
+"""Least time in which full speed, and full rate of turning, is reached. Interpolation overshoots where it is less, and all is slowed."""
 _KNOT_S = 1.0
 """Time between places that are interpolated. At 0.1 m/s^2 the path then moves by a millimetre, and by more where it bends more sharply."""
 MOVED_M = 0.002
@@ -92,6 +94,11 @@ class _Bounds(NamedTuple):
         rate = math.inf if limits.angular_rate is None else limits.angular_rate
         return cls(speed_m_s, rate, np.concatenate([pushed, np.full(3, twisted)]))
 
+    def eased(self, share: float) -> Self:
+        """With a share of the acceleration, and no more than reaches full speed in _RISE_S."""
+        reached = np.repeat([self.speed, self.rate], 3) / _RISE_S
+        return self._replace(acceleration=np.minimum(share * self.acceleration, reached))
+
     def stretch(self, path: Piecewise) -> float:
         """The factor by which all durations of a path may be multiplied for it to just keep the bounds."""
         grid = path.grid(_CHECK_POINTS)
@@ -113,7 +120,7 @@ def hastened(path: Piecewise, speed_m_s: float, limits: Limits, is_flyable: Call
     as_before = min(speed_m_s, _largest(np.linalg.norm(path.grid(_CHECK_POINTS)[..., 7:10], axis=-1))) or speed_m_s
     for speed in sorted({as_before, speed_m_s}):  # thrusters may permit no more than before
         for share in _SHARES:
-            eased = bounds._replace(speed=speed, acceleration=share * bounds.acceleration)
+            eased = bounds._replace(speed=speed).eased(share)
             timed = _interpolated(path, _fastest(path, eased), eased)
             if timed is None:
                 continue
