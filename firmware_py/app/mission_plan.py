@@ -54,7 +54,7 @@ def plan_mission(job: PlanJob, body: Body | None, wanted: Callable[[], bool] = l
             points, places = _waypoints(p_wb, q_wb, section)
             if len(points) > 1:
                 speed, limits = section[0].speed_m_s, _limits(job, _velocity(points, section[0].speed_m_s))
-                path, passed_s = hasten(plan(points, None, limits, body, wanted=wanted), speed, points, limits, body)
+                path, passed_s = hasten(plan(points, None, limits, body, wanted=wanted), speed, points, limits, body, wanted)
                 parts.append((at_s, path))
                 arrivals += [at_s + float(passed_s[place]) for place in places]
                 at_s += path.duration_s

@@ -134,15 +134,26 @@ def _plan(
     return _fit(request, base, free=durations_s is None)
 
 
-def hasten(path: Piecewise, speed_m_s: float, waypoints: Sequence[Waypoint], limits: Limits, body: Body | None = None) -> Timed:
+def hasten(
+    path: Piecewise,
+    speed_m_s: float,
+    waypoints: Sequence[Waypoint],
+    limits: Limits,
+    body: Body | None = None,
+    wanted: Callable[[], bool] = _always,
+) -> Timed:
     """A trajectory that `plan` found, along the same path in less time: at the speed, in any direction, wherever the limits permit it.
 
     Args:
-        waypoints, limits, body: as for `plan`. The limits of acceleration and turning hold anew, and what the body can fly.
+        waypoints, limits, body, wanted: as for `plan`. The limits of acceleration and turning hold anew, and what the body can fly.
+
+    Raises UnwantedError: the trajectory is no longer `wanted`.
     """
     request = _Request.of(waypoints, limits, body)
 
     def is_flyable(found: Piecewise) -> bool:
+        if not wanted():
+            raise UnwantedError
         try:
             request.check(found)
         except InfeasibleError:

@@ -150,7 +150,7 @@ def _corridor(piece: int, a: np.ndarray, b: np.ndarray, radius: float) -> list[P
     along = (b - a) / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
     across = np.cross(along, np.eye(3)[int(np.argmin(np.abs(along)))])
     across /= np.linalg.norm(across)
-    name = f"corridor of {radius:g} m"
+    name = "corridor"
     found = [Plane(piece, 0, along, float(along @ (a + b)) / 2.0, 0.5 * length + radius, name)]
     for k in range(_CORRIDOR_SIDES // 2):
         angle = 2.0 * math.pi * k / _CORRIDOR_SIDES

@@ -9,7 +9,7 @@ import pytest
 from firmware_py.core.rotations import from_euler
 from firmware_py.description.vehicle import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
-from firmware_py.prepare.minimum_snap import Limits, Waypoint, hasten, plan
+from firmware_py.prepare.minimum_snap import Limits, UnwantedError, Waypoint, hasten, plan
 from firmware_py.prepare.piecewise import Piecewise
 from firmware_py.prepare.snap_timing import MOVED_M, Timed, hastened
 
@@ -122,6 +122,11 @@ def test_path_is_slowed_no_more_than_the_robot_needs(survey: Piecewise, slower_t
 def test_robot_that_can_fly_nothing_faster_keeps_its_path(survey: Piecewise) -> None:
     found = hastened(survey, SPEED, LIMITS, lambda found: False)
     assert found.path is survey and found.at_s is survey.breaks
+
+
+def test_timing_that_nobody_waits_for_any_more_ends(survey: Piecewise) -> None:
+    with pytest.raises(UnwantedError):
+        hasten(survey, SPEED, [Waypoint(place) for place in SURVEY], LIMITS, wanted=lambda: False)
 
 
 def test_thrusters_of_a_real_robot_bound_the_pace() -> None:
