@@ -110,7 +110,7 @@ class Piecewise:
         coefficients: (k, 10, 7) of 1, u, ..., u^9 in the share u of each piece's duration; for x, y, z, then the four of the quaternion
             before it is normalised.
         breaks: (k + 1,) s, rising from 0.
-        method: of the solution: "closed form" or "osqp".
+        method: of the solution: "closed form" or "osqp"; "timed" along one of these (snap_timing).
         stretch: factor by which the requested durations were lengthened.
         snap_cost: integral of the squared snap of the position, m^2/s^7.
     """
