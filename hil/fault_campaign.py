@@ -57,11 +57,14 @@ def scenario_of(row: Row, mode: str) -> Scenario:
     base = load_scenario(DOCK_SCENARIO if mode == DOCK else SCENARIO)
     task = dataclasses.replace(base.task, **(row.task if mode == DOCK else {"mode": mode, **row.task}))
     faults = (row.fault, *row.also) if row.fault is not None else ()
-    return dataclasses.replace(base, task=task, fault=tuple(map(_in_first, faults) if mode == DOCK else faults))
+    if mode == DOCK:
+        faults = tuple(_limited(fault, base.module[0].number) for fault in faults)
+    return dataclasses.replace(base, task=task, fault=faults)
 
 
-def _in_first(fault: Fault) -> Fault:
-    return dataclasses.replace(fault, module=1) if TAKES[fault.kind].one_module else fault
+def _limited(fault: Fault, module: int) -> Fault:
+    """The fault in the module with this number alone, if its kind can be restricted to one."""
+    return dataclasses.replace(fault, module=module) if TAKES[fault.kind].one_module else fault
 
 
 def fly_cell(row: Row, mode: str, seed: int, parameters: Parameters | None = None) -> Cell:

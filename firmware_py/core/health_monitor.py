@@ -49,6 +49,8 @@ class _Latest:
 
     time_ns: int = NEVER_NS
     """Time of the last tick."""
+    start_ns: int = NEVER_NS
+    """Time of the first tick."""
     ready_ns: int = NEVER_NS
     """When an attitude was last known."""
     foreign_sync_ns: int = NEVER_NS
@@ -69,8 +71,9 @@ class PerModule:
     def __init__(self, modules: Sequence[int]) -> None:
         never = dict.fromkeys(modules, NEVER_NS)
         self.heard_ns, self.hears_ns, self.answered_ns, self.late_ns = (never.copy() for _ in range(4))
-        self.imu_ns, self.pressure_ns, self.battery_ns, self.cabin_ns, self.wet_ns = (never.copy() for _ in range(5))
-        self.has_pressure, self.unfit, self.leak, self.wet = (dict.fromkeys(modules, False) for _ in range(4))
+        self.imu_ns, self.battery_ns, self.cabin_ns, self.wet_ns = (never.copy() for _ in range(4))
+        self.pressure_ns = dict[int, int]()
+        self.unfit, self.leak, self.wet = (dict.fromkeys(modules, False) for _ in range(3))
         self.voltage_share, self.cabin_c, self.cabin_start_pa, self.cabin_change_pa = (dict[int, float]() for _ in range(4))
 
     def take_over(self, other: PerModule) -> None:
@@ -121,7 +124,7 @@ class HealthMonitor:
         """Inherits from the bodies that this one is made of, or was part of: the last reports of each module, what was believed of it in
         this tick, and `_Latest`.
         """
-        believed = {module: other.believed[module] for other in before if other.believed for module in other._reports.heard_ns}
+        believed = {m: said for other in before for m, said in enumerate(other.believed) if m in other._reports.heard_ns}
         self.believed = [believed.get(module, said) for module, said in enumerate(before[0].believed)]
         for other in before:
             self._stopped_ns |= other._stopped_ns
@@ -136,8 +139,8 @@ class HealthMonitor:
         """Returns the figures of this tick, and stores them in `now`."""
         now, latest = inputs.time_ns, self._latest
         if latest.time_ns == NEVER_NS:  # first tick: silence counts from here
-            latest.time_ns = latest.ready_ns = now
-            for heard_ns in (self._reports.heard_ns, self._reports.hears_ns, self._reports.imu_ns, self._reports.pressure_ns):
+            latest.time_ns = latest.start_ns = latest.ready_ns = now
+            for heard_ns in (self._reports.heard_ns, self._reports.hears_ns, self._reports.imu_ns):
                 heard_ns.update(dict.fromkeys(heard_ns, now))
         self._listen(inputs.modules, now)
         self._hear_stops(inputs.modules, now)
@@ -168,8 +171,8 @@ class HealthMonitor:
             sigma_m=max(estimate.sigma_p.tolist()),
             nis_ratio=self._nis_ratio,
             rejected_share=self._rejected_share,
-            depth_age_s=(now - max(self._reports.pressure_ns.values())) * 1e-9,
-            depth_heard=any(self._reports.has_pressure.values()),
+            depth_age_s=(now - max(self._reports.pressure_ns.values(), default=latest.start_ns)) * 1e-9,
+            depth_heard=len(self._reports.pressure_ns) > 0,
             imu_age_s=(now - max(self._reports.imu_ns.values())) * 1e-9,
             sensor_age_s=self._sensor_age_s(now),
             voltage_share=min(self._reports.voltage_share.values(), default=math.nan),
@@ -224,7 +227,7 @@ class HealthMonitor:
             if believed.gyro is not None and believed.accel is not None:
                 self._reports.imu_ns[index] = now
             if believed.pressure_pa is not None:
-                self._reports.pressure_ns[index], self._reports.has_pressure[index] = now, True
+                self._reports.pressure_ns[index] = now
             for tag in module.tags:
                 if tag.capture_ns > self._pictures_ns[1]:
                     self._pictures_ns = self._pictures_ns[1], tag.capture_ns
@@ -255,8 +258,8 @@ class HealthMonitor:
                 self._stopped_ns.pop(index, None)
 
     def _sensor_age_s(self, now: int) -> float:
-        pressures_ns = [at for m, at in self._reports.pressure_ns.items() if self._reports.has_pressure[m]]
-        return (now - min(*self._reports.imu_ns.values(), *pressures_ns)) * 1e-9 if len(self._reports.imu_ns) > 1 else math.nan
+        imu_ns, pressure_ns = self._reports.imu_ns, self._reports.pressure_ns
+        return (now - min(*imu_ns.values(), *pressure_ns.values())) * 1e-9 if len(imu_ns) > 1 else math.nan
 
     def _tag_gap_s(self, now: int) -> float:
         """Returns the time between the last two tag pictures; NaN once the next one is overdue (twice that time)."""

@@ -77,6 +77,29 @@ class _Pace(NamedTuple):
         return np.asarray(np.minimum(self.times[k] + passed * (self.pace[k] + 0.5 * change * passed), self.times[k + 1]))
 
 
+class _Motion(NamedTuple):
+    """The motion along a path, as it was timed."""
+
+    times: np.ndarray
+    """(n,) s."""
+    velocity: np.ndarray
+    """(n, 6) along each axis of the world, m/s, then about each of the body, rad/s."""
+    acceleration: np.ndarray
+    """(n, 6) the same, m/s^2 and rad/s^2."""
+
+    @classmethod
+    def at(cls, path: Piecewise, times: np.ndarray) -> Self:
+        points = [path.sample(time) for time in times.tolist()]
+        velocity = np.array([np.concatenate([point.v_w, point.w_b]) for point in points])
+        return cls(times, velocity, np.array([np.concatenate([point.a_w, point.alpha_b]) for point in points]))
+
+    @classmethod
+    def along(cls, path: Piecewise) -> Self:
+        """At _POINTS of each piece, its beginning among them, and at the end."""
+        shares = towards_ends(np.arange(_POINTS) / _POINTS)
+        return cls.at(path, np.append(path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * shares, path.breaks[-1]))
+
+
 class _Bounds(NamedTuple):
     """Bounds of a motion; infinite where there is none."""
 
@@ -116,12 +139,12 @@ def hastened(path: Piecewise, speed_m_s: float, limits: Limits, is_flyable: Call
         limits: acceleration, angular_rate and angular_acceleration hold; the others are not looked at.
         is_flyable: whether the robot can fly a path.
     """
-    best, bounds = Timed(path, path.breaks), _Bounds.of(speed_m_s, limits)
+    best, bounds, motion = Timed(path, path.breaks), _Bounds.of(speed_m_s, limits), _Motion.along(path)
     as_before = min(speed_m_s, _largest(np.linalg.norm(path.grid(_CHECK_POINTS)[..., 7:10], axis=-1))) or speed_m_s
     for speed in sorted({as_before, speed_m_s}):  # thrusters may permit no more than before
         for share in _SHARES:
             eased = bounds._replace(speed=speed).eased(share)
-            timed = _interpolated(path, _fastest(path, eased), eased)
+            timed = _interpolated(path, _fastest(motion, eased), eased)
             if timed is None:
                 continue
             timed = timed.slowed(bounds.stretch(timed.path))
@@ -151,16 +174,12 @@ def _largest(values: np.ndarray) -> float:
     return float(max(values.max(), crests(values)[0].max()))
 
 
-def _fastest(path: Piecewise, bounds: _Bounds) -> _Pace:
+def _fastest(motion: _Motion, bounds: _Bounds) -> _Pace:
     """The fastest pace within the bounds.
 
     With z the square of the pace, new velocity is v sqrt(z), and new acceleration a z + v z'/2, with z' the derivative in the path's time.
     """
-    shares = towards_ends(np.arange(_POINTS) / _POINTS)
-    times = np.append(path.breaks[:-1, None] + np.diff(path.breaks)[:, None] * shares, path.breaks[-1])
-    motion = [path.sample(time) for time in times.tolist()]
-    velocity = np.array([np.concatenate([point.v_w, point.w_b]) for point in motion])
-    acceleration = np.array([np.concatenate([point.a_w, point.alpha_b]) for point in motion])
+    times, velocity, acceleration = motion
     speed, rate = np.linalg.norm(velocity[:, :3], axis=1), np.linalg.norm(velocity[:, 3:], axis=1)
     least = np.maximum(speed / bounds.speed, rate / bounds.rate)
     most = np.clip(1.0 / np.maximum(least, 1.0 / _GREATEST_PACE), _LEAST_PACE, None) ** 2
@@ -230,8 +249,7 @@ def _worth_keeping(path: Piecewise, knots: np.ndarray, times: np.ndarray, own: n
         knots, times: (n,) s, new times and those of the path.
         own: indices of the path's breaks.
     """
-    motion = [path.sample(time) for time in times.tolist()]
-    velocity = np.array([np.concatenate([point.v_w, point.w_b]) for point in motion]) * np.gradient(times, knots)[:, None]
+    velocity = _Motion.at(path, times).velocity * np.gradient(times, knots)[:, None]
     changing = np.any(np.abs(np.gradient(velocity, knots, axis=0)) > _STEADY * bounds.acceleration, axis=1)
     keep = changing.copy()
     keep[1:] |= changing[:-1]
