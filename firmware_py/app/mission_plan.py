@@ -12,7 +12,7 @@ from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import Setpoint
 from firmware_py.ground.mission_flight import Plan, PlanJob
 from firmware_py.ground.mission_legs import GO_TO, Leg
-from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, distinct, hasten, plan
+from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, distinct, fastest, plan
 from firmware_py.prepare.piecewise import Piecewise
 from firmware_py.prepare.snap_timing import MOVED_M
 
@@ -20,8 +20,6 @@ _SAME = 1e-3
 """Largest difference, in position (m) and in quaternion, at which neighbouring waypoints count as one."""
 _ANGULAR_RATE, _ANGULAR_ACCELERATION = 0.5, 0.5
 """rad/s and rad/s^2. Turns on the way are gentle, so that the tag stays readable."""
-_LEAST_SHARE = 1e-3
-"""Least share of a speed that is permitted along an axis: an axis that does not move needs a limit above zero too."""
 _THRUSTER_SHARE = 0.6
 """Share of each thruster's range that a mission may use; the rest is reserved against the current."""
 
@@ -53,8 +51,7 @@ def plan_mission(job: PlanJob, body: Body | None, wanted: Callable[[], bool] = l
         for section in _sections(job.legs):
             points, places = _waypoints(p_wb, q_wb, section)
             if len(points) > 1:
-                speed, limits = section[0].speed_m_s, _limits(job, _velocity(points, section[0].speed_m_s))
-                path, passed_s = hasten(plan(points, None, limits, body, wanted=wanted), speed, points, limits, body, wanted)
+                path, passed_s = fastest(points, section[0].speed_m_s, _limits(job), body, wanted)
                 parts.append((at_s, path))
                 arrivals += [at_s + float(passed_s[place]) for place in places]
                 at_s += path.duration_s
@@ -104,18 +101,8 @@ def _end(points: Sequence[Waypoint]) -> tuple[np.ndarray, np.ndarray]:
     return last.p_wb, last.q_wb
 
 
-def _velocity(points: Sequence[Waypoint], speed_m_s: float) -> np.ndarray:
-    """(3,) velocity limit along each axis, m/s, that keeps the speed: on a straight line in its direction, else in every direction."""
-    way = np.abs(points[-1].p_wb - points[0].p_wb)
-    if len(points) > 2 or not way.any():
-        return np.full(3, speed_m_s / np.sqrt(3.0))
-    return np.asarray(speed_m_s * np.maximum(way / np.linalg.norm(way), _LEAST_SHARE))
-
-
-def _limits(job: PlanJob, velocity: np.ndarray) -> Limits:
-    """The limits of a job, with that of `velocity` (3,) along each axis, m/s."""
+def _limits(job: PlanJob) -> Limits:
     return Limits(
-        velocity=velocity,
         acceleration=np.full(3, job.acceleration),
         corridor_m=job.corridor_m - MOVED_M,
         angular_rate=_ANGULAR_RATE,

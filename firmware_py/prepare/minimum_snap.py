@@ -18,9 +18,9 @@ from firmware_py.prepare.piecewise import Piecewise
 from firmware_py.prepare.snap_limits import InfeasibleError, Limits, Place, crests, planes, solve_limited, worst
 from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
 from firmware_py.prepare.snap_thrust import divide, sag, usage
-from firmware_py.prepare.snap_timing import Timed, hastened
+from firmware_py.prepare.snap_timing import Timed, hastened, stretch_within
 
-__all__ = ["InfeasibleError", "Limits", "UnwantedError", "Waypoint", "distinct", "hasten", "plan"]
+__all__ = ["InfeasibleError", "Limits", "UnwantedError", "Waypoint", "distinct", "fastest", "plan"]
 
 ATTITUDE_LEVER_M = 0.5
 """One radian counts as this many metres when time is divided among the pieces."""
@@ -131,36 +131,46 @@ def _plan(
     request.check_standing()
     if durations_s is None:
         check_bounded(waypoints, limits, body)
-    return _fit(request, base, free=durations_s is None)
+    free = durations_s is None
+    return _fit(lambda factor: replace(request.attempt(base * factor), stretch=factor), free, both_ways=free and request.passes_at_speed())
 
 
-def hasten(
-    path: Piecewise,
-    speed_m_s: float,
+def fastest(
     waypoints: Sequence[Waypoint],
+    speed_m_s: float,
     limits: Limits,
     body: Body | None = None,
     wanted: Callable[[], bool] = _always,
 ) -> Timed:
-    """A trajectory that `plan` found, along the same path in less time: at the speed, in any direction, wherever the limits permit it.
+    """The path of least snap within the corridor, rest to rest, at each place as fast as the speed and the other limits permit there.
+
+    Of paths that differ only in pace, all or none are within a corridor: one solution is enough, where `plan` seeks the durations with a
+    dozen. Where no such path is found, it leads straight from stop to stop.
 
     Args:
-        waypoints, limits, body, wanted: as for `plan`. The limits of acceleration and turning hold anew, and what the body can fly.
+        waypoints: two or more, no two neighbours equal (see `distinct`), without given velocities.
+        speed_m_s: largest speed, in any direction.
+        limits: acceleration, angular_rate and angular_acceleration bound the pace; velocity is not looked at.
+        body: must be able to fly the path, as for `plan`.
+        wanted: called before each check of a path.
 
-    Raises UnwantedError: the trajectory is no longer `wanted`.
+    Raises:
+        InfeasibleError: states what the body cannot fly, and where.
+        UnwantedError: the trajectory is no longer `wanted`.
     """
-    request = _Request.of(waypoints, limits, body)
+    request = _Request.of(waypoints, replace(limits, velocity=None, acceleration=None), body, wanted)
+    request.check_standing()
+    path = request.path_in_corridor()
+    path = path.slowed(stretch_within(path, speed_m_s, limits))
 
     def is_flyable(found: Piecewise) -> bool:
-        if not wanted():
-            raise UnwantedError
         try:
-            request.check(found)
+            request.checked(found)
         except InfeasibleError:
             return False
         return True
 
-    return hastened(path, speed_m_s, limits, is_flyable)
+    return hastened(_fit(lambda factor: request.checked(path.slowed(factor)), free=False), speed_m_s, limits, is_flyable)
 
 
 def check_bounded(waypoints: Sequence[Waypoint], limits: Limits, body: Body | None = None) -> None:
@@ -196,21 +206,27 @@ def distinct(waypoints: Sequence[Waypoint], same: float = _SAME) -> tuple[list[W
     return kept, own
 
 
-def _fit(request: _Request, base: np.ndarray, free: bool) -> Piecewise:
-    """The trajectory with the smallest feasible stretch of all of `base`; the stretch is below 1 only where durations are free."""
-    high, best = _first_feasible(request, base, both_ways=free and request.passes_at_speed())
+def _fit(attempt: Callable[[float], Piecewise], free: bool, both_ways: bool = False) -> Piecewise:
+    """The trajectory with the smallest feasible stretch of all durations.
+
+    Args:
+        attempt: the trajectory at a stretch; raises InfeasibleError.
+        free: whether the stretch may be below 1.
+        both_ways: whether stretches below 1 may be feasible where none above 1 is.
+    """
+    high, best = _first_feasible(attempt, both_ways)
     if high == 1.0 and not free:
         return best
     low = 0.5 * high if high > 1.0 else high
     while low == high:
-        shorter = request.try_stretch(base, 0.5 * low)
+        shorter = _feasible(attempt, 0.5 * low)
         if shorter is None:
             low *= 0.5
         else:
             best, low, high = shorter, 0.5 * low, 0.5 * high
     while high > (1.0 + _STRETCH_TOLERANCE) * low:
         middle = math.sqrt(low * high)
-        tried = request.try_stretch(base, middle)
+        tried = _feasible(attempt, middle)
         if tried is None:
             low = middle
         else:
@@ -218,15 +234,25 @@ def _fit(request: _Request, base: np.ndarray, free: bool) -> Piecewise:
     return replace(best, stretch=1.0) if free else best
 
 
-def _first_feasible(request: _Request, base: np.ndarray, both_ways: bool) -> tuple[float, Piecewise]:
-    """The first feasible stretch of `base` out of 1, 2, 4, ..., or out of 1, 2, 1/2, 4, 1/4, ..., and its trajectory."""
+def _first_feasible(attempt: Callable[[float], Piecewise], both_ways: bool) -> tuple[float, Piecewise]:
+    """The first feasible stretch out of 1, 2, 4, ..., or out of 1, 2, 1/2, 4, 1/4, ..., and its trajectory."""
     factor = 1.0
     while factor <= _LONGEST_STRETCH:
         for tried in (factor, 1.0 / factor) if both_ways and factor > 1.0 else (factor,):
-            if (found := request.try_stretch(base, tried)) is not None:
+            if (found := _feasible(attempt, tried)) is not None:
                 return tried, found
         factor *= 2.0
-    return _LONGEST_STRETCH, request.attempt(base * _LONGEST_STRETCH)
+    return _LONGEST_STRETCH, attempt(_LONGEST_STRETCH)
+
+
+def _feasible(attempt: Callable[[float], Piecewise], factor: float) -> Piecewise | None:
+    """The trajectory at a stretch, or None where it is infeasible but longer durations may help."""
+    try:
+        return attempt(factor)
+    except InfeasibleError as error:
+        if isinstance(error, _UnreachableError) and factor >= 1.0:
+            raise
+        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,19 +316,24 @@ class _Request:
         knots.derivative[:, :, :3] = self.position.derivative
         return divide_time(knots, total)
 
-    def try_stretch(self, base: np.ndarray, factor: float) -> Piecewise | None:
-        """The trajectory at `factor` times the durations, or None where it is infeasible but longer durations may help."""
-        try:
-            return replace(self.attempt(base * factor), stretch=factor)
-        except InfeasibleError as error:
-            if isinstance(error, _UnreachableError) and factor >= 1.0:
-                raise
-            return None
-
     def attempt(self, durations: np.ndarray) -> Piecewise:
         """The trajectory in exactly these durations. Raises InfeasibleError and UnwantedError."""
-        if not self.wanted():
-            raise UnwantedError
+        self._check_wanted()
+        found = self._path(durations)
+        self.check(found)
+        return found
+
+    def path_in_corridor(self) -> Piecewise:
+        """The path of least snap, or, where none is found, straight from stop to stop; in durations of its own, and not checked."""
+        durations = self.durations(None)
+        try:
+            return self._path(durations)
+        except InfeasibleError:
+            stops = replace(self.position, fixed=np.ones_like(self.position.fixed))
+            return replace(self, position=stops)._path(durations)
+
+    def _path(self, durations: np.ndarray) -> Piecewise:
+        """The trajectory in exactly these durations, not checked. Raises InfeasibleError where it would break a limit of the position."""
         system = System.of(durations)
         unknown = solve(system, self.position)
         bounds = planes(self.position.value, self.limits)
@@ -313,9 +344,17 @@ class _Request:
         both = np.concatenate([system.coefficients(self.position.value, unknown), turning], axis=2)
         breaks = np.concatenate([[0.0], np.cumsum(durations)])
         cost = system.cost(self.position.value, unknown)
-        found = Piecewise(np.ascontiguousarray(both), breaks, method, 1.0, cost)
+        return Piecewise(np.ascontiguousarray(both), breaks, method, 1.0, cost)
+
+    def checked(self, found: Piecewise) -> Piecewise:
+        """The same trajectory, if `check` does not refuse it. Raises InfeasibleError and UnwantedError."""
+        self._check_wanted()
         self.check(found)
         return found
+
+    def _check_wanted(self) -> None:
+        if not self.wanted():
+            raise UnwantedError
 
     def check(self, found: Piecewise) -> None:
         """Refuses a trajectory that turns too far or too fast, or that the body cannot fly. Raises InfeasibleError."""

@@ -134,6 +134,10 @@ class Piecewise:
         """(k, per_piece + 1, 20) p, q, v, w, a, alpha and the length of the quaternion before normalising."""
         return np.asarray(_grid(self.coefficients, self.breaks, per_piece))
 
+    def slowed(self, factor: float) -> Piecewise:
+        """The same path in `factor` times the time."""
+        return replace(self, breaks=factor * self.breaks, snap_cost=self.snap_cost / factor**7)
+
     def halved(self, which: np.ndarray) -> Piecewise:
         """The same path, with the pieces selected by `which` (k,) split in two."""
         parts = [_HALVES @ piece if cut else piece[None] for piece, cut in zip(self.coefficients, which, strict=True)]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -56,7 +55,7 @@ class Timed(NamedTuple):
 
     def slowed(self, factor: float) -> Timed:
         """Every duration times `factor`."""
-        return Timed(replace(self.path, breaks=factor * self.path.breaks), factor * self.at_s)
+        return Timed(self.path.slowed(factor), factor * self.at_s)
 
 
 class _Pace(NamedTuple):
@@ -128,6 +127,11 @@ class _Bounds(NamedTuple):
         speed, rate, twist = (_largest(np.linalg.norm(grid[..., k : k + 3], axis=-1)) for k in (7, 10, 16))
         push = _largest(np.max(np.abs(grid[..., 13:16]) / self.acceleration[:3], axis=-1))
         return max(speed / self.speed, rate / self.rate, math.sqrt(push), math.sqrt(twist / float(self.acceleration[3])))
+
+
+def stretch_within(path: Piecewise, speed_m_s: float, limits: Limits) -> float:
+    """The factor by which all durations of a path may be multiplied for it to just keep what `hastened` keeps."""
+    return _Bounds.of(speed_m_s, limits).stretch(path)
 
 
 def hastened(path: Piecewise, speed_m_s: float, limits: Limits, is_flyable: Callable[[Piecewise], bool]) -> Timed:

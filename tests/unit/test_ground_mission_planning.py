@@ -122,7 +122,7 @@ def test_mission_that_comes_on_the_way_to_a_place_is_not_begun_by_choosing_its_i
 
 
 def test_plan_that_nobody_waits_for_any_more_is_not_made_to_its_end(world: World, client: Client) -> None:
-    """Planning 150 places takes most of a minute. Regression: the next plan waited for its end."""
+    """Planning hundreds of places takes a minute. Regression: the next plan waited for its end."""
     asked = iter([True, True, False])
     plan = plan_mission(planning(world, client), None, lambda: next(asked))
     assert plan.trajectory is None and next(asked, "no more") == "no more"
