@@ -8,12 +8,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse as sparse
+from numba import njit
 from scipy.optimize import linprog
 
 from firmware_py.core import rotations
 from firmware_py.core.body import RANK_TOLERANCE, Body, rank_by
-from firmware_py.core.drag_lookup import drag_wrench
-from firmware_py.core.rigid_body import coriolis_wrench, restoring_moment
+from firmware_py.core.drag_lookup import NODES, add_drag
+from firmware_py.core.rigid_body import add_restoring, take_coriolis
+from firmware_py.core.rotations import M, V, rotate_back
 
 _SATURATION_TOLERANCE = 1e-6
 """Tolerance, as a share of a thruster's limit, within which the thruster counts as saturated."""
@@ -54,17 +56,30 @@ def wrenches(body: Body, motion: np.ndarray) -> np.ndarray:
         body: masses, drag, righting moment.
         motion: (k, 19) p_wb, q_wb, v_w, w_b, a_w, alpha_b.
     """
-    out, nu, change = (np.empty((len(motion), 6)) for _ in range(3))
-    for row, velocity, turned in zip(np.ascontiguousarray(motion), nu, change, strict=True):
-        velocity[:3], velocity[3:] = rotations.rotate_back(row[3:7], row[7:10]), row[10:13]
-        turned[:3], turned[3:] = rotations.rotate_back(row[3:7], row[13:16]), row[16:19]
-    change[:, :3] -= np.cross(nu[:, 3:], nu[:, :3])
-    drag = body.drag
-    for k, row in enumerate(np.ascontiguousarray(motion)):
-        out[k] = body.mass @ change[k] + coriolis_wrench(body.mass, nu[k])
-        out[k] -= drag_wrench(drag.nodes, drag.rotational, drag.linear, nu[k])
-        out[k, 3:] -= restoring_moment(body.righting, row[3:7])
+    out, drag = np.empty((len(motion), 6)), body.drag
+    _take_wrenches(body.mass, body.righting, drag.nodes, drag.rotational, drag.linear, np.ascontiguousarray(motion), out)
     return out
+
+
+@njit(f"void({M},{V},{NODES},{V},{V},{M},{M})", cache=True, error_model="numpy")
+def _take_wrenches(mass, righting, nodes, rotational, linear, motion, out):  # type: ignore[no-untyped-def]
+    """Writes the (k, 6) wrenches of `wrenches`."""
+    nu, change, passive = np.empty(6), np.empty(6), np.empty(6)
+    for k in range(len(motion)):
+        q_wb, w_b = motion[k, 3:7], motion[k, 10:13]
+        nu[:3], nu[3:] = rotate_back(q_wb, motion[k, 7:10]), w_b
+        change[:3], change[3:] = rotate_back(q_wb, motion[k, 13:16]), motion[k, 16:19]
+        change[0] -= w_b[1] * nu[2] - w_b[2] * nu[1]
+        change[1] -= w_b[2] * nu[0] - w_b[0] * nu[2]
+        change[2] -= w_b[0] * nu[1] - w_b[1] * nu[0]
+        passive[:] = 0.0
+        take_coriolis(mass, nu, passive)
+        add_drag(nodes, rotational, linear, nu, passive)
+        add_restoring(righting, q_wb, passive)
+        for i in range(6):
+            out[k, i] = -passive[i]
+            for j in range(6):
+                out[k, i] += mass[i, j] * change[j]
 
 
 def divide(body: Body, motion: np.ndarray) -> Division:
@@ -101,9 +116,9 @@ def _change_by_lean(body: Body, motion: np.ndarray, axis: np.ndarray) -> np.ndar
     ends = []
     for step in (_LEAN_STEP, -_LEAN_STEP):
         by, leant = rotations.exp(step * axis), motion.copy()
-        for row in leant:
-            row[3:7] = rotations.multiply(row[3:7].copy(), by)
-            row[10:13], row[16:19] = rotations.rotate_back(by, row[10:13].copy()), rotations.rotate_back(by, row[16:19].copy())
+        leant[:, 3:7] = motion[:, 3:7] @ [rotations.multiply(unit, by) for unit in np.eye(4)]
+        back = np.array([rotations.rotate_back(by, unit) for unit in np.eye(3)])
+        leant[:, 10:13], leant[:, 16:19] = motion[:, 10:13] @ back, motion[:, 16:19] @ back
         ends.append(wrenches(body, leant))
     return np.asarray((ends[0] - ends[1]) / (2.0 * _LEAN_STEP))
 
