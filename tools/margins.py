@@ -26,11 +26,12 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
+from firmware_py.description.parameters import CONTROLLERS, Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import AXES, load_vehicle
 from firmware_py.prepare.assembly import PITCH_M
 from firmware_py.prepare.joints import Placement, check_joints
+from hil.cli import parameters_of
 from hil.workers import processes
 
 BARS = {"nominal": (8.0, 40.0), "worst": (6.0, 35.0)}
@@ -189,7 +190,7 @@ def main() -> int:
     given = parser.parse_args()
     try:
         check_bodies(given.modules, given.vehicle)
-        chosen = CONTROLLERS.get(given.controller) or load_parameters(Path(given.controller))
+        chosen = parameters_of(given.controller)
         with folder_for_results(given.out):
             check_results(given.out, "crossover_rad_s", "margins.json", "margins.png")
             return write_and_report(given.out, measured(given.modules, chosen, given.vehicle, given.jobs))

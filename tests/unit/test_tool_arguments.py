@@ -81,6 +81,7 @@ def test_help_tells_the_value_of_every_option_that_is_left_out(run: Run, capsys:
             "margins", ["--vehicle", "bluerov2"],
             "margins: 2 of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --modules 1",
         ),
+        ("margins", ["--controller", "papr"], "margins: controller 'papr' is unknown; did you mean paper? there are modcube, "),
         ("mutants", ["nosuch"], "mutants: nosuch: unknown; there are transitions, "),
         ("characterise", ["nosuch"], "characterise: vehicle 'nosuch' is unknown; there are "),
         ("characterise", ["modcube", "--force", "1e300"], "characterise: --force 1e+300: permitted: 1e-06 to 1e+06; see --help"),
