@@ -157,7 +157,7 @@ def peak_memory_mb() -> float:
 def main() -> None:
     """Holds a cube of modules in a process of its own; prints the results."""
     parser = Parser(description=__doc__)
-    parser.add_argument("side", type=int, help="edge of the cube, in modules")
+    parser.add_argument("side", type=int, choices=range(1, 5), help="edge of the cube, in modules")
     flight = Hold(cube_of(parser.parse_args().side))
     tick_us = flight.run(TIMED_TICKS)
     print(json.dumps({"tick_us": tick_us, "strayed_m": flight.strayed_m, "memory_mb": peak_memory_mb()}))

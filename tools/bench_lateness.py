@@ -22,6 +22,7 @@ from typing import Any
 from command_line import Parser, run_tool
 
 import numpy as np
+from argument_types import positive
 from bench_entry import Entry
 
 from firmware_py.app.firmware import BusFrame
@@ -39,6 +40,8 @@ from hil.scenario import load_scenario
 RATES_HZ = (100, 200, 400)
 FLIGHT_S = 60.0
 SETTLE_S = 3.0
+LEAST_S = SETTLE_S + 1.0
+"""Shortest flight that leaves ticks to compare after settling, s."""
 BUS = "udp:239.74.163.11:43711"
 NS_PER_S = 1_000_000_000
 ENDS = 0.1
@@ -118,9 +121,13 @@ def lateness_entries() -> list[Entry]:
 def main() -> None:
     """Flies once and prints the results."""
     parser = Parser(description=__doc__)
-    parser.add_argument("rate", type=int, help="tick rate, Hz")
-    parser.add_argument("seconds", type=float, help="duration of the flight, s")
+    parser.add_argument("rate", type=int, help="tick rate, Hz, 50 to 400")
+    parser.add_argument("seconds", type=positive, help=f"duration of the flight, s, {LEAST_S:g} or more")
     given = parser.parse_args()
+    if not 50 <= given.rate <= 400:
+        parser.error(f"argument rate: {given.rate} is outside 50 to 400")
+    if given.seconds < LEAST_S:
+        parser.error(f"argument seconds: {given.seconds:g} is too short; {LEAST_S:g} or more are needed")
     if hasattr(os, "sched_setaffinity"):  # the bench pins itself to one core, a vehicle does not
         os.sched_setaffinity(0, range(os.cpu_count() or 1))
     print(json.dumps(fly(given.rate, given.seconds)))
