@@ -91,7 +91,8 @@ def with_ground(
     """
 
     def requests(time_ns: int, last: Outputs | None) -> list[Request]:
-        operator.stopping = operator.stopping or side.reboot_asked
+        if side.reboot_asked:  # never a False stored: a signal meanwhile has asked for the stop
+            operator.stop()
         asked = [request for request in side.requests() if request.action in STOP_ACTIONS or not operator.stopping]
         if any(request.action in STOP_ACTIONS for request in asked):
             operator.to_arm.clear()

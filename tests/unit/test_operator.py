@@ -241,3 +241,20 @@ def test_modules_of_a_body_that_a_person_takes_over_are_the_persons_when_it_part
     flight.robot.bodies = Robot(2).bodies
     flight.run(2 * SECOND)
     assert flight.arms == []
+
+
+def test_signal_that_comes_while_a_reboot_is_looked_for_ends_the_run() -> None:
+    flight = Flight(to_arm=set())
+
+    class Signalled:
+        requests = staticmethod(flight._asked)
+
+        @property
+        def reboot_asked(self) -> bool:
+            flight.operator.stop()  # Python calls the handler of a signal between any two steps of the tick
+            return False
+
+    side: Any = Signalled()
+    flight._requests = with_ground(flight.operator, side, lambda: flight.robot.bodies)
+    flight.run(1)
+    assert flight.operator.stopping
