@@ -64,7 +64,7 @@ lint: setup ## ruff, mypy and the import contracts
 	@$(BIN)/mypy --no-error-summary $(MYPY_LOOSE) tools tests
 	@found=$$($(BIN)/lint-imports --no-logo) || { echo "$$found"; exit 1; }
 
-quick: lint ## lint and the fast tests, two minutes and a half on two idle cores: for every commit
+quick: lint ## lint and the fast tests, a minute on two idle cores: for every commit
 	@$(PY) -m pytest -x -q -n 2 -m 'not slow and not vcan and not clients and not jetson'
 
 test: setup ## lint and all tests that this machine can run; names what is left out in its last lines

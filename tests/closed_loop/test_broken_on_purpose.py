@@ -125,6 +125,7 @@ def test_robot_that_no_camera_saw_is_said_to_lack_a_tag(
     assert "no tag was ever seen, and without a pose the robot is not armed: " in said and why in said
 
 
+@pytest.mark.slow
 def test_flight_without_any_firmware_is_refused_in_one_line(fly: Fly) -> None:
     killed = dataclasses.replace(shortened("hover", 0.5, settle_s=1.1), fault=(Fault(kind="process_killed"),))
     with pytest.raises(DescriptionError, match="no signals or no truth of body 0 in the logs; was the"):
@@ -206,6 +207,7 @@ def test_the_same_hover_unbroken_passes(fly: Fly) -> None:
     assert fly(shortened("hover", HOVER_S, SETTLE_S)).passed
 
 
+@pytest.mark.slow
 def test_fault_after_the_early_end_of_the_steps_is_told(fly: Fly, capsys: pytest.CaptureFixture[str]) -> None:
     plan = load_scenario("dock")
     faults = (Fault(kind="thruster_dead", at_s=0.5, module=1, index=0), Fault(kind="leak", at_s=100.0, module=2))

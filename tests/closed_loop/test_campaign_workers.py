@@ -152,6 +152,7 @@ def test_seed_that_kills_its_process_costs_no_other(tmp_path: Path, monkeypatch:
     assert len(started) <= 19 + 4 + 2 * 3  # plus the trials under way in two processes at the two deaths that were not alone
 
 
+@pytest.mark.slow
 def test_workers_end_with_the_process_that_began_them() -> None:
     code = (
         "import os; from hil.workers import processes\n"
@@ -165,6 +166,7 @@ def test_workers_end_with_the_process_that_began_them() -> None:
         os.close(worker)
 
 
+@pytest.mark.slow
 def test_no_more_processes_are_started_than_there_is_work_for() -> None:
     before = len(active_children())
     with processes(99)() as pool:
@@ -197,6 +199,7 @@ else:
 PRESS = "os.killpg(0, signal.SIGINT)"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moment", ["at_import", "in_flight"])
 def test_workers_that_a_terminal_interrupts_end_at_once_without_a_word_and_leave_no_file(moment: str, tmp_path: Path) -> None:
     """A terminal signals all of them."""

@@ -24,6 +24,7 @@ def test_module_in_still_water_with_ideal_sensors_keeps_its_place_within_half_a_
     assert result.metrics["attitude_rmse_rad"] <= 0.003  # encoding one tag attitude costs 0.0031 rad RMS: can_dbc/README.md
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 1])
 def test_module_with_real_sensors_in_a_gusty_current_keeps_its_place_within_five_millimetres(
     fly: Fly, seed: int

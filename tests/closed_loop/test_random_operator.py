@@ -67,6 +67,7 @@ BREAKS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rule", RULES)
 def test_robot_that_is_broken_on_purpose_breaks_the_rule(rule: str, monkeypatch: Patch) -> None:
     monkeypatch.setattr(hil.random_operator, "SCENARIOS", ("hover",))

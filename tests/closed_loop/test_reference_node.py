@@ -177,6 +177,7 @@ def test_estop_ends_pushing_at_once_and_until_it_is_released(nodes: CNodes) -> N
     assert magnets(nodes) == PUSHES
 
 
+@pytest.mark.slow
 def test_c_node_switches_its_magnets_as_the_plants_own_does_frame_for_frame(nodes: CNodes) -> None:
     """Frames come, stop, and come again around the 2 s timeout and an e-stop."""
     scenario = shortened("hover", 1.0)

@@ -38,12 +38,14 @@ def spoil(path: Path, frame_id: str, tick: int, change: int) -> None:
     path.write_text("".join(lines))
 
 
+@pytest.mark.slow
 def test_flight_comes_out_to_the_byte(flown: Path) -> None:
     outcome = replay(flown)
     assert (outcome.first, outcome.ticks, outcome.torn) == (None, TICKS, "")
     assert outcome.seconds == pytest.approx(4.99)
 
 
+@pytest.mark.slow
 def test_replay_of_a_log_with_one_flipped_bit_fails_and_says_where_and_how_much_was_compared(log: Path) -> None:
     data = bytearray((log / SIGNAL_LOG).read_bytes())
     data[len(data) // 2] ^= 1
@@ -57,6 +59,7 @@ def test_replay_of_a_log_with_one_flipped_bit_fails_and_says_where_and_how_much_
     assert said[-1] == "every byte is the same up to there"
 
 
+@pytest.mark.slow
 def test_replay_of_a_log_that_ends_too_early_passes_and_says_how_much_was_compared(log: Path) -> None:
     data = (log / SIGNAL_LOG).read_bytes()
     (log / SIGNAL_LOG).write_bytes(data[: len(data) // 2])
@@ -66,6 +69,7 @@ def test_replay_of_a_log_that_ends_too_early_passes_and_says_how_much_was_compar
     assert re.match(rf"compared \d+ of {TICKS} ticks, ", said[1])
 
 
+@pytest.mark.slow
 def test_replay_of_frames_with_a_spoilt_block_fails(log: Path) -> None:
     data = (log / CAN_LOG).read_bytes()
     (log / CAN_LOG).write_bytes(data[:100_000] + 4096 * b"\0" + data[104_096:])
@@ -107,6 +111,7 @@ def test_estimator_that_was_changed_is_named(flown: Path, monkeypatch: pytest.Mo
     assert "/firmware/body0" in first.signal
 
 
+@pytest.mark.slow
 def test_command_that_is_not_the_recorded_one_is_named(log: Path) -> None:
     spoil(log / CAN_LOG, THRUSTER_CMD_A, 400, 0x01)
     first = replay(log).first
@@ -116,6 +121,7 @@ def test_command_that_is_not_the_recorded_one_is_named(log: Path) -> None:
     assert abs(int(first.recorded) - int(first.replayed)) == 1
 
 
+@pytest.mark.slow
 def test_frame_that_came_otherwise_is_dropped_and_so_named(log: Path) -> None:
     spoil(log / CAN_LOG, GYRO, 300, 0x10)
     first = replay(log).first
@@ -135,6 +141,7 @@ def test_tolerance_lets_pass_what_is_within_it(flown: Path, monkeypatch: pytest.
     assert replay(flown, 1e-5).first is not None
 
 
+@pytest.mark.slow
 def test_replay_says_how_it_went_and_ends_with_that_status(log: Path) -> None:
     said: list[str] = []
     assert replay_and_say(log, 0.0, said.append) == 0

@@ -90,6 +90,7 @@ def test_after_an_e_stop_nothing_turns_whatever_else_happens(seed: int) -> None:
     assert flight.was_armed
 
 
+@pytest.mark.slow
 def test_stop_that_was_raised_before_the_start_stands_though_the_first_answers_of_the_modules_are_lost() -> None:
     """A module releases its stop at the first DISARMED command, so none may be sent before the stop is known."""
     silence = Fault(kind="frame_loss", value=1.0, at_s=0.0, until_s=0.035, direction="from_plant")

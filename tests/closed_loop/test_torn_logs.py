@@ -79,6 +79,7 @@ def test_killed_process_leaves_a_log_that_lacks_a_second_at_the_most(tmp_path: P
     assert (mended.first, mended.ticks, mended.torn) == (None, outcome.ticks, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_torn_log_is_read_up_to_the_tear_and_mended(log: Path, seed: int) -> None:
     shares = np.random.default_rng(seed).uniform(0.05, 1.0, 2)
@@ -101,6 +102,7 @@ def test_torn_log_is_read_up_to_the_tear_and_mended(log: Path, seed: int) -> Non
     assert recover(log) == (len(ticks), "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("share", [0.5, 1.0])
 def test_torn_log_of_the_bench_is_mended_with_that_of_the_vehicle(log: Path, share: float) -> None:
     """Regression: it stayed torn, and readers of MCAP other than our own refuse a file without an end."""
@@ -117,6 +119,7 @@ def test_torn_log_of_the_bench_is_mended_with_that_of_the_vehicle(log: Path, sha
     assert recover(log) == (last, "")
 
 
+@pytest.mark.slow
 def test_log_on_a_disk_without_links_is_mended_too(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(source: Path, target: Path) -> None:
         raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
@@ -137,6 +140,7 @@ def test_log_that_is_torn_again_keeps_what_the_first_mend_set_aside(log: Path) -
     assert {path.name: path.read_bytes() for path in log.glob("*.torn*")} == aside
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("renames", range(2))
 @pytest.mark.parametrize("torn", [(CAN_LOG,), (SIGNAL_LOG,), (CAN_LOG, SIGNAL_LOG)], ids="+".join)
 def test_mend_that_is_killed_between_two_renames_loses_nothing(
@@ -161,6 +165,7 @@ def test_mend_that_is_killed_between_two_renames_loses_nothing(
     assert before <= {path.read_bytes() for path in log.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fill", [b"\0", b"\xff", b"\n", b"\r", b"7"])
 @pytest.mark.parametrize("begin", [100_000, 100_017])
 def test_can_log_with_a_spoilt_block_is_read_up_to_it_and_mended(log: Path, fill: bytes, begin: int) -> None:
@@ -181,6 +186,7 @@ def test_can_log_with_a_spoilt_block_is_read_up_to_it_and_mended(log: Path, fill
     assert (mended.first, mended.ticks, mended.torn) == (None, outcome.ticks, "")
 
 
+@pytest.mark.slow
 def test_block_that_can_log_holds_twice_is_not_kept_by_its_mending(log: Path) -> None:
     """The repeated block contains the ticks before the damage a second time."""
     path, begin = log / CAN_LOG, 100_017
@@ -192,6 +198,7 @@ def test_block_that_can_log_holds_twice_is_not_kept_by_its_mending(log: Path) ->
     assert (mended.first, mended.ticks, mended.torn) == (None, ticks, "")
 
 
+@pytest.mark.slow
 def test_damage_is_told_of_a_log_that_was_not_closed_too(log: Path) -> None:
     """A lost supply causes both; the missing end is the lesser loss."""
     path = log / CAN_LOG
@@ -217,6 +224,7 @@ def test_log_of_a_flight_that_goes_on_is_not_mended(tmp_path: Path) -> None:
     assert recover(tmp_path) == (0, "")
 
 
+@pytest.mark.slow
 def test_long_can_log_is_cut_without_being_held_in_memory(log: Path) -> None:
     path, last = log / CAN_LOG, max(ticks_of(log))
     stamp = candump_stamp(last * 1_000_000_000 // TICKS_A_SECOND)
@@ -230,6 +238,7 @@ def test_long_can_log_is_cut_without_being_held_in_memory(log: Path) -> None:
     assert held < (log / "long.log").stat().st_size / 2
 
 
+@pytest.mark.slow
 def test_half_a_line_of_can_log_is_left_out(log: Path) -> None:
     tear(log / SIGNAL_LOG, 0.9)
     (log / CAN_LOG).write_bytes((log / CAN_LOG).read_bytes()[:-20])

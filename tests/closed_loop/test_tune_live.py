@@ -200,6 +200,7 @@ def test_step_is_taken_when_it_is_confirmed_and_goes_when_nothing_is_kept(tuned:
     assert person.questions[-1].startswith("keep POS_BW ")
 
 
+@pytest.mark.slow
 def test_what_makes_the_hover_stiller_stays_and_the_rest_goes_back_at_once(
     live: Any, robot: Robot, tuned: Callable[..., int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -247,6 +248,7 @@ def test_old_values_are_back_after(name: str, live: Any, robot: Robot, tuned: Ca
         robot.wait(2.0)
 
 
+@pytest.mark.slow
 def test_link_that_breaks_again_while_the_old_values_go_back_is_tried_again(robot: Robot, tuned: Callable[..., int], capsys: Any) -> None:
     def cut() -> None:
         for _ in range(2):
@@ -256,12 +258,14 @@ def test_link_that_breaks_again_while_the_old_values_go_back_is_tried_again(robo
     assert f"old values are back: {OLD}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_error_that_nobody_foresaw_puts_the_old_values_back_before_it_is_seen(robot: Robot, tuned: Callable[..., int], capsys: Any) -> None:
     with pytest.raises(ZeroDivisionError):
         tuned(Scripted("y", then=lambda: robot.soon(ZeroDivisionError())))
     assert f"old values are back: {OLD}" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_output_that_nobody_reads_any_more_puts_the_old_values_back(
     tuned: Callable[..., int], capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -295,6 +299,7 @@ def test_terminal_that_is_closed_interrupts_once(
     live.tune_live(None, "mavlink:udpin:nowhere", 1, SECONDS, tmp_path)
 
 
+@pytest.mark.slow
 def test_signals_do_not_come_between_the_vehicle_and_its_old_values(
     live: Any, robot: Robot, tuned: Callable[..., int], signals: tuple[signal.Signals, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -370,6 +375,7 @@ def test_objective_that_telemetry_does_not_show_is_refused(tuned: Callable[..., 
         tuned(Scripted(), OBJECTIVE.replace("position_rmse_m", "supply_power_w"))
 
 
+@pytest.mark.slow
 def test_e_stop_puts_the_old_values_back(robot: Robot, tuned: Callable[..., int], capsys: Any) -> None:
     """Must be the last test, because it leaves the robot stopped."""
     assert tuned(Scripted("y", then=lambda: robot.soon(Request(Action.ESTOP)))) == 1

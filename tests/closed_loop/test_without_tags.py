@@ -210,6 +210,7 @@ def test_blind_robot_that_goes_through_water_is_not_taken_for_one_that_is_held(p
     assert flight.truth[-1].p_wb[0] > 1.5
 
 
+@pytest.mark.slow
 def test_no_mode_that_keeps_a_place_is_armed_without_a_tag() -> None:
     flight = Flight(Pilot(Mode.POSHOLD, 3.0))
     assert flight.records[-1].state == State.DISARMED
@@ -248,6 +249,7 @@ class Tilted(Pilot):
         return super().requests(time_ns, last) + ([Request(Action.HOLD, 0, pose)] if time_ns == 3_000_000_000 else [])
 
 
+@pytest.mark.slow
 def test_tilted_robot_whose_bus_was_interrupted_stays_where_it_is() -> None:
     """Regression: its thrusters, which held the tilt, stopped unheard; 4 s later it was 1.8 m off, and 2.9 m from its estimate."""
     flight = Flight(Tilted(Mode.POSHOLD, 14.5), Fault(kind="frame_loss", at_s=10.0, until_s=10.3, value=1.0), blind_s=(9.0, 1e6))

@@ -63,6 +63,7 @@ def protection(frame, message):
     return {"Counter": frame.data[-2] >> 4, "Crc": frame.data[-1]} if message.protected else {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESSAGES)
 @EXAMPLES
 @given(data=st.data())
@@ -77,6 +78,7 @@ def test_cantools_reads_what_we_send(name, oracle, data):
     assert read == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESSAGES)
 @EXAMPLES
 @given(data=st.data())
@@ -96,6 +98,7 @@ def test_we_read_what_cantools_sends(name, oracle, data):
     assert received.values == pytest.approx([scaled[field] for field in message.fields], rel=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESSAGES)
 @EXAMPLES
 @given(data=st.data())
@@ -107,6 +110,7 @@ def test_physical_values_become_the_same_bytes_as_with_cantools(name, oracle, da
     assert oracle.get_message_by_name(name).encode(filled) == frame.data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MESSAGES)
 @EXAMPLES
 @given(data=st.data())
@@ -204,6 +208,7 @@ def test_one_flipped_bit_always_drops_a_protected_frame(name, data):
     assert receiver.accept(frame) is not None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROTECTED)
 @FEW_EXAMPLES
 @given(data=st.data())

@@ -175,6 +175,7 @@ def test_tag_with_another_way_down_does_not_agree(tilt_rad: float, agrees: bool)
 # ---------------------------------------------------------------- the estimator
 
 
+@pytest.mark.slow
 def test_robot_without_a_tag_stands_upright_after_a_second() -> None:
     robot = Robot()
     assert not robot.rest(100).ready
@@ -208,6 +209,7 @@ def test_depth_that_was_not_heard_at_first_is_taken_when_it_comes(depth_m: float
     assert estimate.p_wb[2] == pytest.approx(depth_m, abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("accel_m_s2", [1.0, 3.0])
 def test_robot_that_is_pushed_across_when_it_stands_up_rights_itself(accel_m_s2: float) -> None:
     """The thrusters push it, which the model contains: the tilt is wrong by up to 17 deg at first."""
@@ -223,6 +225,7 @@ def test_robot_that_is_pushed_across_when_it_stands_up_rights_itself(accel_m_s2:
     assert np.linalg.norm(difference(robot.rest(1000).q_wb, robot.q_wb)) < 0.02
 
 
+@pytest.mark.slow
 def test_steady_thrust_for_a_minute_is_believed_to_drive_nobody_mad() -> None:
     """Half stick: without bounds the velocity estimate grew to 15 m/s."""
     robot = Robot(from_euler(0.1, 0.0, 0.0))
@@ -236,6 +239,7 @@ def test_steady_thrust_for_a_minute_is_believed_to_drive_nobody_mad() -> None:
     assert np.linalg.norm(difference(estimate.q_wb, multiply(heading(estimate.q_wb), robot.q_wb))) < 0.05
 
 
+@pytest.mark.slow
 def test_heading_that_nobody_told_is_not_learned_from_noise() -> None:
     """Heading and vertical gyro bias used to count as known, and a bump turned the estimate by 344 deg."""
     rng, robot, q_wb = np.random.default_rng(1), Robot(from_euler(0.0, 0.0, 0.0)), []
@@ -248,6 +252,7 @@ def test_heading_that_nobody_told_is_not_learned_from_noise() -> None:
     assert abs(robot.estimator.motion.x[15]) < 1e-3
 
 
+@pytest.mark.slow
 def test_rise_or_fall_that_no_depth_tells_is_not_believed_to_go_on_for_ever() -> None:
     robot = Robot(from_euler(0.1, 0.0, 0.0))
     drag, way = np.zeros(6), np.r_[0.4, 0.0, 0.45, np.zeros(3)]
@@ -262,6 +267,7 @@ def test_rise_or_fall_that_no_depth_tells_is_not_believed_to_go_on_for_ever() ->
     assert np.linalg.norm(difference(estimate.q_wb, multiply(heading(estimate.q_wb), robot.q_wb))) < 0.03
 
 
+@pytest.mark.slow
 def test_tags_that_come_too_seldom_to_be_believed_keep_nobody_from_standing_up() -> None:
     robot, ready = Robot(), []
     for tick in range(1000):
@@ -314,6 +320,7 @@ def test_ten_tags_that_tell_the_same_give_place_and_heading() -> None:
     assert estimate.sigma_p.max() < 0.05 and estimate.rejected == 0
 
 
+@pytest.mark.slow
 def test_what_was_learned_upright_stays_when_the_place_is_told() -> None:
     """The thrusters hold the body down with 2 N against an unmodelled force, which is learnt without any tag."""
     robot = Robot()
@@ -386,6 +393,7 @@ def test_robot_whose_process_stood_still_stands_up_where_it_was() -> None:
     np.testing.assert_allclose(difference(estimate.q_wb, Q_WB), 0.0, atol=0.02)
 
 
+@pytest.mark.slow
 def test_robot_that_was_adrift_for_long_believes_ten_tags_and_not_one() -> None:
     robot = Robot()
     robot.rest(20)
@@ -400,6 +408,7 @@ def test_robot_that_was_adrift_for_long_believes_ten_tags_and_not_one() -> None:
     assert estimate.rejected == 0 and estimate.tag_age_ns == 3 * PERIOD and estimate.sigma_p[0] < 0.05
 
 
+@pytest.mark.slow
 def test_robot_that_was_adrift_bumps_into_a_wall_and_still_knows_its_gyros() -> None:
     robot, bump = Robot(), np.array([0.4, -0.3, 0.5])
     robot.rest(20)
@@ -413,6 +422,7 @@ def test_robot_that_was_adrift_bumps_into_a_wall_and_still_knows_its_gyros() -> 
     np.testing.assert_allclose(robot.estimator._anchor.x[13:16], 0.0, atol=0.001)
 
 
+@pytest.mark.slow
 def test_robot_that_made_its_heading_up_learns_its_gyros_when_tags_come() -> None:
     robot, bias = Robot(), np.array([0.0, 0.0, 0.01])
     for _ in range(6000):

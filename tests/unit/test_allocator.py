@@ -384,6 +384,7 @@ def test_other_limits_count_at_once_and_are_kept_when_a_thruster_dies(single: Bo
         assert thrust.margin == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("size", [0.3, 1.0, 3.0])
 def test_body_that_cannot_be_fed_gives_way_in_the_force_that_does_not_hold_first(body: Body, size: float) -> None:
     """Directions are kept and no module exceeds its supply; the share left unused is less than a step of the bisection."""

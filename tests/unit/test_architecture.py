@@ -67,6 +67,7 @@ def contract(contract_id: str) -> dict[str, list[str]]:
     return next(each for each in linter["contracts"] if each["id"] == contract_id)
 
 
+@pytest.mark.slow
 def test_import_contracts_are_kept() -> None:
     lint_imports = Path(sys.executable).with_name("lint-imports")
     result = subprocess.run([lint_imports, "--no-cache"], cwd=ROOT, capture_output=True, text=True)
@@ -77,6 +78,7 @@ def test_no_contract_has_ignores() -> None:
     assert "ignore_imports" not in (ROOT / "pyproject.toml").read_text()
 
 
+@pytest.mark.slow
 def test_core_imports_only_what_may_run_in_a_tick() -> None:
     stdlib = set(sys.stdlib_module_names) - CORE_BANNED_STDLIB
     refused = [

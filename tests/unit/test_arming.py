@@ -274,11 +274,13 @@ def tank_of(name: str, **changes: Any) -> Tank:
     return tank
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bluerov2", "girona500", "modcube"])
 def test_shipped_vehicle_that_declares_its_passive_axis_is_armed(name: str) -> None:
     assert tank_of(name).run(0.1, Request(Action.ARM)).records[0].state == State.ARMED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "axis"), [("bluerov2", "pitch"), ("girona500", "roll")])
 def test_vehicle_with_an_axis_that_nothing_pushes_or_rights_is_not_armed(name: str, axis: str) -> None:
     tank = tank_of(name, passive_dof=())

@@ -110,6 +110,7 @@ def test_each_thruster_pushes_about_the_common_centre_of_mass(shape: str, lopsid
     np.testing.assert_allclose(body.thrusters.matrix @ body.thrusters.pinv, np.eye(6), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_turned_module_brings_its_thrusters_and_tags_along(modcube: Vehicle) -> None:
     upright = assemble_vehicle(modcube)
     for rotation in range(24):

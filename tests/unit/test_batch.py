@@ -32,6 +32,7 @@ def one_by_one(world: World, commands: np.ndarray) -> np.ndarray:
     return np.array(rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3, 10])  # alone; eight lanes, some idle; eight and two
 def test_batch_is_the_single_plant_to_the_last_bit(count: int) -> None:
     commands = pushes(count)
@@ -41,6 +42,7 @@ def test_batch_is_the_single_plant_to_the_last_bit(count: int) -> None:
     assert count == 1 or not np.array_equal(together[0], together[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scenario", ["spiral", "mobius-1"])
 def test_batch_is_the_single_plant_in_a_box_and_in_a_cylinder(scenario: str) -> None:
     commands = pushes(4, 400)
@@ -49,6 +51,7 @@ def test_batch_is_the_single_plant_in_a_box_and_in_a_cylinder(scenario: str) -> 
         assert np.array_equal(each, one_by_one(world, u))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 3])
 def test_world_goes_on_where_the_batch_has_put_it(count: int) -> None:
     commands = pushes(count, 60)

@@ -56,6 +56,7 @@ def test_turned_shape_is_the_same_shape_and_its_mirror_image_is_not() -> None:
     assert canonical(mirrored) != canonical(screw)
 
 
+@pytest.mark.slow
 def test_best_shape_has_the_margin_that_no_pose_beats() -> None:
     vehicle = load_vehicle("modcube")
     found = rank(Task(name="push", wrench=PUSH), 3, vehicle)
@@ -69,6 +70,7 @@ def test_best_shape_has_the_margin_that_no_pose_beats() -> None:
     assert found[0].best.margin >= found[1].best.margin
 
 
+@pytest.mark.slow
 def test_ranking_follows_what_was_asked_for() -> None:
     vehicle = load_vehicle("modcube")
     for what in ("power", "variance"):
@@ -78,6 +80,7 @@ def test_ranking_follows_what_was_asked_for() -> None:
         assert all(choice.guaranteed_n == choice.whole_n for choice in found)
 
 
+@pytest.mark.slow
 def test_shape_that_cannot_do_the_task_comes_last() -> None:
     vehicle = load_vehicle("modcube")
     alone = rank(Task(name="haul", wrench=2.0 * PUSH, rank_by="power"), 1, vehicle)[0]
@@ -214,6 +217,7 @@ def test_wrong_command_line_is_answered_in_one_line(
     assert shown.out == "" and shown.err.count("\n") == 1, shown.err
 
 
+@pytest.mark.slow
 def test_table_has_labels_with_units_and_no_keys_of_the_json(characterise: Callable[..., str]) -> None:
     shown = characterise("bluerov2", "--directions", "121", "--force", "2")
     assert re.findall(r"\w+_\w+|\w+\[", shown) == []

@@ -42,6 +42,7 @@ def test_authors_robots_have_the_known_inscribed_ellipsoids(name: str, force: fl
         assert largest_inscribed(section.normals, section.offsets).volume == pytest.approx(volume, rel=4e-4)
 
 
+@pytest.mark.slow
 def test_volume_of_the_force_frame_grows_with_the_cube_of_the_modules() -> None:
     volumes = []
     for name in ("A_single", "B_double_line", "C_quad_2x2"):
@@ -62,6 +63,7 @@ def test_linear_programs_and_facets_agree_for_each_of_the_seven_robots(name: str
             assert reach_by_programs(part, wrenches) == pytest.approx(space.reach(wrenches), rel=1e-6, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(20))
 def test_linear_programs_and_facets_agree_for_random_polycubes(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -121,6 +123,7 @@ def test_three_pairs_of_dead_thrusters_cost_the_paper_module_a_degree_of_freedom
     assert min(space.worst("force") for space in spaces) == pytest.approx(3.8, abs=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dead", [1, 2])
 def test_what_any_dead_thrusters_leave_is_the_worst_of_all_cases(dead: int) -> None:
     vehicle = load_vehicle("modcube")

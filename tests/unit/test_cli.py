@@ -86,6 +86,7 @@ def test_folder_without_a_name_is_refused(arguments: list[str], tmp_path: Path, 
     assert "'' is no folder; give one, or . for this one" in refusal(*arguments, "")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "wrong", "right"),
     [
@@ -142,6 +143,7 @@ def test_folder_that_cannot_be_made_is_refused(tmp_path: Path, refusal: Callable
     assert str(file) in refusal("hil", "run", "hover", "--out", str(file / "run"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [["hil", "run", "hover"], ["run", "--bus", "virtual:out-is-a-file"]], ids=["hil run", "run"])
 def test_folder_that_is_a_file_is_refused_with_what_is_needed(command: list[str], tmp_path: Path, refusal: Callable[..., str]) -> None:
     file = tmp_path / "README.md"
@@ -202,6 +204,7 @@ except SystemExit as ended:
 """
 
 
+@pytest.mark.slow
 def test_no_file_takes_the_place_of_a_standard_stream_that_is_closed() -> None:
     command = [sys.executable, "-c", OPENED_AFTER_A_COMMAND, "vehicle"]
     assert subprocess.run(["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *command]).returncode == 0
@@ -218,6 +221,7 @@ def test_list_names_every_scenario_with_one_line_of_help(printed: Callable[..., 
     assert all(len(line.split()) > 3 for line in lines)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arguments", ["--help", "hil --help", "hil run --help", "hil list"])
 def test_help_and_list_wait_for_no_code_of_the_bench_to_be_compiled(arguments: str) -> None:
     look = "import atexit, sys; atexit.register(lambda: print('firmware_py.core.rotations' in sys.modules, file=sys.stderr))"
@@ -248,6 +252,7 @@ def test_printed_parameters_are_a_file_of_parameters(tmp_path: Path, printed: Ca
     assert load_parameters(whole) == load_parameters(mine) == Parameters().replace("control.lead_s", 0.1)
 
 
+@pytest.mark.slow
 def test_printed_parameters_say_what_each_is_and_may_be(printed: Callable[..., str]) -> None:
     lines = printed("parameters").splitlines()
     for name, limits in registry():
@@ -255,6 +260,7 @@ def test_printed_parameters_say_what_each_is_and_may_be(printed: Callable[..., s
         assert len(told) == 1 and f"; {describe(limits)}" in told[0] and limits.mavlink in told[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", vehicle_names())
 def test_printed_vehicle_is_the_vehicle(name: str, tmp_path: Path, printed: Callable[..., str]) -> None:
     mine = tmp_path / "mine.toml"
@@ -276,12 +282,14 @@ def test_vehicles_are_printed_by_name(printed: Callable[..., str]) -> None:
     assert printed("vehicle").split() == vehicle_names()
 
 
+@pytest.mark.slow
 def test_groups_of_parameters_are_printed_alone(refusal: Callable[..., str], printed: Callable[..., str]) -> None:
     assert list(tomllib.loads(printed("parameters", "fence", "control"))) == ["control", "fence"]
     line = refusal("parameters", "fences")
     assert "group 'fences'" in line and "did you mean fence? there are control, " in line
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("options", "folder"),
     [
@@ -310,6 +318,7 @@ def test_campaigns_of_different_robots_have_folders_of_their_own(
     assert taken == [Path("runs") / folder]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("options", "folder"), [
     ([], "hover"), (["--seed", "7"], "hover-seed-7"), (["--rate", "200"], "hover-200hz"),
     (["--sensors", "ideal", "--realtime", "--bus", "udp:239.74.163.9:43131", "--seed", "7"], "hover-ideal-realtime-seed-7"),

@@ -137,6 +137,7 @@ def test_hull_that_grazes_another_touches_it() -> None:
     assert times_of(hulls, estimates, {0: STILL, 5: STILL}, math.inf)[0] == 4.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(40))
 def test_times_of_many_bodies_are_those_of_small_steps(seed: int) -> None:
     """Against a march in steps of 1 ms of every module of three bodies, each of which moves on while the others do."""
@@ -214,6 +215,7 @@ def test_pair_that_docks_is_to_touch_and_a_third_body_is_not() -> None:
     assert pair(moving, waiting, ((0, 7), (7, 5)))[0] > 0.0
 
 
+@pytest.mark.slow
 def test_body_out_of_sight_keeps_others_farther_off() -> None:
     """It counted for minutes as exactly where its last tag was, and a body swam into where a current had carried it."""
     moving = at(ZERO, [0.2, 0.0, 0.0])

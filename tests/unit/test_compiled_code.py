@@ -25,6 +25,7 @@ def cache_of(package: Path, changed: float) -> Path:
     return written(package / "__pycache__" / "sums.run-3.py311.nbi", changed)
 
 
+@pytest.mark.slow
 def test_compiled_code_older_than_any_source_that_it_may_have_taken_in_is_forgotten(tmp_path: Path) -> None:
     for package, changed in (("used", 300), ("mine", 200)):
         written(tmp_path / package / "sums.py", changed)

@@ -268,6 +268,7 @@ WRONG: dict[str, Callable[[float, int], float]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", [Mode.POSHOLD, Mode.ALT_HOLD])
 @pytest.mark.parametrize("wrong", WRONG)
 def test_robot_that_sees_tags_keeps_mode_and_depth_when_its_pressure_sensor_fails_and_says_so(wrong: str, mode: Mode) -> None:
@@ -279,6 +280,7 @@ def test_robot_that_sees_tags_keeps_mode_and_depth_when_its_pressure_sensor_fail
     assert any(event.text == "fail-safe on: no pressure for 1.0 s" for outputs in tank.outputs for event in outputs.events)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset_pa", [700.0, 3000.0, -3000.0])
 def test_robot_keeps_its_depth_when_the_weather_changes_at_once(offset_pa: float) -> None:
     """Three decimetres moved it by 0.2 m."""
@@ -287,12 +289,14 @@ def test_robot_keeps_its_depth_when_the_weather_changes_at_once(offset_pa: float
     assert not any("fail-safe" in event.text for outputs in tank.outputs for event in outputs.events)
 
 
+@pytest.mark.slow
 def test_robot_that_loses_the_tags_with_a_false_pressure_comes_up_as_one_that_knows_no_depth() -> None:
     tank, _ = with_pressure(WRONG["5 m too deep"], Mode.ALT_HOLD, 2.0)
     tamper_with(tank, lose_tags)
     assert tank.run(7.0).records[0].mode == Mode.SURFACE
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("offset_m", [-3.5, 5.0, 19.5])
 @pytest.mark.parametrize("blind_s", [0.0, 5.0])
 def test_first_tags_give_a_pose_whatever_the_pressure_sensor_tells(offset_m: float, blind_s: float) -> None:
@@ -311,6 +315,7 @@ def test_first_tags_give_a_pose_whatever_the_pressure_sensor_tells(offset_m: flo
     assert abs(estimate.p_wb[2] - tank.states[0][2]) < 0.01
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("height_m", "period_s"), [(0.03, 4.0), (0.05, 2.0), (0.05, 4.0)])
 def test_robot_in_small_waves_keeps_holding_its_depth_when_the_tags_go(height_m: float, period_s: float) -> None:
     """The sensor erred by less than the gate, and was distrusted for it; without tags the robot surfaced."""

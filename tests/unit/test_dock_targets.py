@@ -39,6 +39,7 @@ def test_pilot_of_the_target_feels_no_blow_when_another_docks_to_it() -> None:
     assert max(forward) < 1.2 * forward[-1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_target_that_is_disarmed_is_not_expected_to_come(approach: str) -> None:
     tank = tank_with_row(2.0, parameters=Parameters().replace("docking.approach", approach), armed=(1,))
@@ -163,6 +164,7 @@ def test_target_comes_to_meet_the_first_of_two_alone() -> None:
     assert goal.p_wb[1] == pytest.approx(0.5 * (2.0 - PITCH_M - Parameters().docking.standoff_m), abs=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_dock_whose_way_leads_through_a_third_body_is_refused(approach: str) -> None:
     tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (1.1, 1.0), parameters=Parameters().replace("docking.approach", approach))
@@ -171,6 +173,7 @@ def test_dock_whose_way_leads_through_a_third_body_is_refused(approach: str) -> 
     assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD and abs(tank.states[1][1] - 2.0) < 0.05
 
 
+@pytest.mark.slow
 def test_dock_whose_target_would_come_through_a_third_body_is_refused() -> None:
     """The active body goes level to the stand-off; the target, which comes half of that way, has another body beside it."""
     tank = tank_with_modules_at((1.0, 0.0), (2.0, 1.5), (1.0, 0.45))
@@ -180,6 +183,7 @@ def test_dock_whose_target_would_come_through_a_third_body_is_refused() -> None:
     assert len(outputs.docks) == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("north_m", [0.45, -0.45])
 def test_dock_past_a_third_body_that_leaves_room_is_begun(north_m: float) -> None:
     tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (1.0 + north_m, 1.0))
@@ -203,6 +207,7 @@ def test_dock_waits_while_a_third_body_is_on_its_way_and_then_goes_on() -> None:
     assert tank.outputs[-1].docks[0].stage == Stage.ALIGN
 
 
+@pytest.mark.slow
 def test_dock_says_of_each_module_once_that_it_waits_though_two_are_as_near() -> None:
     """Noise decides which of two modules on the way is the nearer one."""
     tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (1.6, 0.9), (1.6, 1.3))

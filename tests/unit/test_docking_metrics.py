@@ -61,6 +61,7 @@ PLACES = [[0.0, 0.0, 0.4], [0.21, 0.0, 0.4], [0.5, 0.0, 0.4]]
 DOCK = Step(do="dock", module=2, face="-x", target_module=1, target_face="+x")
 
 
+@pytest.mark.slow
 def test_dock_counts_with_the_faces_that_were_named() -> None:
     joined = truth_of([APART, PAIR], PLACES)
     assert is_as_asked(asked(DOCK), joined)
@@ -70,6 +71,7 @@ def test_dock_counts_with_the_faces_that_were_named() -> None:
     assert not is_as_asked(asked(DOCK, Step(do="undock", module=2, target_module=1)), joined)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turns", range(4))
 def test_dock_counts_with_the_quarter_turns_that_were_asked_for(turns: int) -> None:
     joined = truth_of([APART, PAIR], PLACES)
@@ -79,6 +81,7 @@ def test_dock_counts_with_the_quarter_turns_that_were_asked_for(turns: int) -> N
     assert counts == [wanted == turns for wanted in range(4)]
 
 
+@pytest.mark.slow
 def test_module_that_is_undocked_and_docked_to_another_of_the_same_body_is_as_asked() -> None:
     """The module moves from one end of a pair to the other."""
     moved = [((0, 1, 2),), PAIR, PAIR, ((0, 1, 2),)]

@@ -269,6 +269,7 @@ def test_drift_of_a_pair_is_between_the_means_of_its_newest_pictures_and_those_b
             assert status.spread_m == pytest.approx(abs(np.mean(gaps_m[-8:]) - np.mean(gaps_m[-16:-8])), abs=1e-9)
 
 
+@pytest.mark.slow
 def test_pair_that_jammed_four_millimetres_short_is_not_docked_in_a_minute_of_noise(row: Row) -> None:
     row.noise_m, row.gaps_m[0] = 0.002, 0.0045
     bank = PairBank(ROW[:1], P)

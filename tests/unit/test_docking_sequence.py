@@ -45,6 +45,7 @@ def test_quarter_turns_are_counted_about_the_targets_face_outwards(
     np.testing.assert_allclose((q_t.inv() * q_a).as_matrix(), wanted.as_matrix(), atol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_m", [0.02, 0.12, 0.2, 0.6])
 @pytest.mark.parametrize("parameters", [Docking(), PAPER.docking])
 def test_dock_that_fails_ends_apart_however_near_it_began(parameters: Docking, gap_m: float) -> None:
@@ -194,6 +195,7 @@ def test_jam_that_a_camera_too_slow_makes_is_told_by_the_parameter_that_helps() 
     )
 
 
+@pytest.mark.slow
 def test_approach_that_waits_to_the_end_of_its_time_is_no_jam_and_is_over() -> None:
     """It used to count as a jam: the magnets pushed at whatever stood there, and the dock was tried again."""
     dock = Follower(Docking(timeout_s=20.0))
@@ -204,6 +206,7 @@ def test_approach_that_waits_to_the_end_of_its_time_is_no_jam_and_is_over() -> N
     assert dock.sequence.reason == "APPROACH took longer than 20 s, waiting for another body"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("approach", "waiting"), [("staged", Stage.APPROACH), ("straight", Stage.PRE_APPROACH)])
 def test_time_that_an_approach_waited_is_not_taken_from_what_it_has_to_dock(approach: str, waiting: Stage) -> None:
     """An approach that waited 19 of 20 s used to count as a jam before it arrived, and let go with pushing magnets."""
@@ -229,6 +232,7 @@ def test_approach_that_is_to_make_room_goes_back_and_begins_anew() -> None:
     dock.until(Stage.PUSH)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("approach", ["staged", "straight"])
 def test_who_waits_or_makes_room_at_its_stand_off_does_not_go_on_from_there(approach: str) -> None:
     """It used to align, where nothing waits: it came before the face, made room again, and so on endlessly; or drew its line too early."""
@@ -242,6 +246,7 @@ def test_who_waits_or_makes_room_at_its_stand_off_does_not_go_on_from_there(appr
     dock.until(Stage.PUSH)
 
 
+@pytest.mark.slow
 def test_straight_approach_that_is_to_make_room_goes_back_on_its_line_as_far_as_it_came() -> None:
     dock, came = Follower(Docking(approach="straight")), list[np.ndarray]()
     for _ in range(300):
@@ -315,6 +320,7 @@ def test_jam_lets_go_backs_off_turns_a_little_and_is_tried_again_to_the_other_si
     assert dock.step().relay == RELAY_OFF
 
 
+@pytest.mark.slow
 def test_module_that_does_not_get_away_stays_in_back_off_until_its_time_is_over() -> None:
     dock = Follower(Docking(tries=2, timeout_s=20.0))
     dock.until(Stage.BACK_OFF)
@@ -330,6 +336,7 @@ def test_module_that_does_not_get_away_stays_in_back_off_until_its_time_is_over(
     assert dock.sequence.reason == "BACK_OFF took longer than 20 s"
 
 
+@pytest.mark.slow
 def test_module_backs_off_slowly_as_far_as_the_stand_off() -> None:
     dock, gaps = Follower(), list[float]()
     dock.until(Stage.BACK_OFF)
@@ -344,6 +351,7 @@ def test_module_backs_off_slowly_as_far_as_the_stand_off() -> None:
     assert dock.sequence.errors(dock.at, dock.there).gap_m == pytest.approx(STAGED.standoff_m, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_faces_that_are_still_near_while_they_push_apart_are_no_dock() -> None:
     dock = Follower()
     dock.until(Stage.RELEASE)
@@ -355,6 +363,7 @@ def test_faces_that_are_still_near_while_they_push_apart_are_no_dock() -> None:
     assert dock.sequence.stage == Stage.DOCKED
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", ["active", "target"])
 def test_dock_needs_both_places_known_but_backs_off_blindly(side: str) -> None:
     dock = Follower()
@@ -387,6 +396,7 @@ def test_push_of_no_time_is_a_jam_at_once() -> None:
     assert dock.sequence.reason == "jam: neither condition after PUSH, 1 try"
 
 
+@pytest.mark.slow
 def test_push_goes_no_farther_than_it_may() -> None:
     dock = Follower(Docking(push_s=10.0))
     dock.until(Stage.PUSH)

@@ -80,18 +80,21 @@ def way_past(third_m: tuple[float, ...], length_m: float, cells: list[tuple[int,
     return first_blocking_module(Way(body, -half, LEVEL, half, LEVEL, PITCH_M), [(third, estimate(np.array(third_m)))], STAGED, math.inf)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("along_m", np.linspace(-10.0, 10.0, 9).tolist())
 def test_body_that_a_long_way_just_touches_is_met_wherever_it_is(along_m: float) -> None:
     assert way_past((along_m, 0.29, 0.0), 30.0, [(0, 0, 0)]) == 9
     assert way_past((along_m, 0.31, 0.0), 30.0, [(0, 0, 0)]) is None
 
 
+@pytest.mark.slow
 def test_body_that_only_the_outermost_module_touches_is_met() -> None:
     row = [(0, k, 0) for k in range(5)]
     assert way_past((0.0, 2 * PITCH_M + 0.29, 0.0), 3.0, row) == 9
     assert way_past((0.0, 2 * PITCH_M + 0.31, 0.0), 3.0, row) is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gap_m", [0.12, 0.0])
 def test_way_of_a_tilted_pair_leads_its_module_before_the_face_of_the_other(gap_m: float) -> None:
     dock = Follower()

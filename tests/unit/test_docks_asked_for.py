@@ -77,6 +77,7 @@ def test_dock_from_afar_glides_to_the_stand_off_and_keeps_it() -> None:
     assert len(tank.outputs) - first < 2000
 
 
+@pytest.mark.slow
 def test_dock_whose_way_leads_through_the_target_is_refused() -> None:
     tank = tank_with_row(2.0)
     outputs = tank.run(3.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
@@ -84,12 +85,14 @@ def test_dock_whose_way_leads_through_the_target_is_refused() -> None:
     assert outputs.records[1].mode == Mode.POSHOLD and abs(tank.states[1][1] - 2.0) < 0.05
 
 
+@pytest.mark.slow
 def test_straight_dock_is_begun_from_anywhere_as_the_papers() -> None:
     tank = tank_with_row(2.0, parameters=Parameters().replace("docking.approach", "straight"))
     outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
     assert [dock.stage for dock in outputs.docks] == [Stage.APPROACH] and outputs.records[1].mode == Mode.DOCK
 
 
+@pytest.mark.slow
 def test_body_whose_dock_is_over_may_dock_again() -> None:
     tank = tank_with_row(0.6)
     outputs = tank.run(1.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
@@ -98,6 +101,7 @@ def test_body_whose_dock_is_over_may_dock_again() -> None:
     assert len(outputs.docks) == 1 and outputs.records[1].mode == Mode.DOCK
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("wanted", [DockRequest(2, 3, 0, 2), DockRequest(2, 2, 1, 3)], ids=["of the target", "of who docks"])
 def test_dock_to_a_face_that_another_dock_is_to_close_is_refused(wanted: DockRequest) -> None:
     """Both bodies would go to the same place and collide there."""
@@ -108,6 +112,7 @@ def test_dock_to_a_face_that_another_dock_is_to_close_is_refused(wanted: DockReq
     assert outputs.records[2].mode == Mode.POSHOLD
 
 
+@pytest.mark.slow
 def test_dock_that_would_bring_a_module_where_another_dock_brings_one_is_refused() -> None:
     """Two pairs go to two faces of one robot, and the second modules of both would end at the same place, off its corner."""
     tank = FaultyTank([(0, 0, 0), (-1, 0, 0), (0, 0, 0), (1, 0, 0), (0, 0, 0), (0, 1, 0)], each=2)
@@ -306,6 +311,7 @@ def test_dock_whose_plan_is_still_awaited_when_the_target_of_the_one_before_is_t
     assert [(dock.module_a, dock.module_b) for dock in outputs.docks] == [(5, 3)] and outputs.records[2].mode == Mode.DOCK
 
 
+@pytest.mark.slow
 def test_refused_dock_does_not_end_the_one_that_was_asked_for_after_it() -> None:
     tank = FaultyTank([(0, 0, 0), (0, 1, 0)], apart=True, delay=20)
     tank.without_current = {0, 1}

@@ -298,6 +298,7 @@ def test_service_tells_that_it_is_ready_alive_and_how_it_fares(tmp_path: Path) -
     assert "tick=300" in reports[-1] and "answered=1/1" in reports[-1]
 
 
+@pytest.mark.slow
 def test_service_is_ready_once_after_a_second_at_every_rate() -> None:
     """systemd kills a service that never reports ready after 90 s, in flight."""
     keeper = RateKeeper(PERIOD_NS, MonotonicClock(), lambda deadline_ns: None)

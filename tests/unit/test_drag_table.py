@@ -320,6 +320,7 @@ def test_cache_that_cannot_be_written_is_refused_in_one_line(tmp_path: Path) -> 
     assert str(given.exception) == f"--cache {tmp_path / 'file'}: {tmp_path / 'file'} is a file; a folder is needed"
 
 
+@pytest.mark.slow
 def test_picture_is_right_handed_with_z_down_and_its_table_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn: list[Figure] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: drawn.append(figure))

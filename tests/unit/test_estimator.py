@@ -163,6 +163,7 @@ def test_tag_fixes_the_datum_of_the_depth(body: Body) -> None:
     assert_rests(estimate)
 
 
+@pytest.mark.slow
 def test_current_and_trim_are_learned_as_a_disturbance(body: Body) -> None:
     """The thrusters hold the robot against a force in the world, 2 N north, and a trim moment; the estimate shows both."""
     force_w, moment_b = np.array([2.0, -1.0, 0.5]), np.array([0.05, -0.08, 0.02])
@@ -216,6 +217,7 @@ def disturbance_doubt(vehicle: str, current_walk: float, speed_m_s: float) -> fl
     return float(np.sqrt(robot.estimator.motion.covariance[18, 18]) / body.mass[0, 0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["modcube", "bluerov2_heavy"])
 def test_robot_under_way_doubts_the_current_by_its_drag_and_one_at_rest_does_not(vehicle: str) -> None:
     """Two random walks add in quadrature; the second is that of the current times the slope of the drag, as far as the speed is kept."""

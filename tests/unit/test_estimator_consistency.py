@@ -324,6 +324,7 @@ def sigmas_under_way(body: Body, rate_hz: int, speed_m_s: float) -> np.ndarray:
     return np.r_[estimate.sigma_p, estimate.sigma_q]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("speed_m_s", [0.0, 1.0], ids=["at rest", "under way"])
 def test_filter_is_as_sure_at_every_tick_rate(body: Body, speed_m_s: float) -> None:
     """More samples average out only noise that is drawn afresh for each; the error of a wrong mass is not of that kind."""
@@ -357,6 +358,7 @@ def test_wrong_lever_arm_of_the_tag_would_be_noticed(body: Body, drawn: list[tup
     assert np.mean([np.square((e.p_wb - x[:3]) / e.sigma_p) for x, e in pairs]) > 5.0
 
 
+@pytest.mark.slow
 def test_drag_of_the_wrong_sign_would_be_noticed(body: Body) -> None:
     """At 0.7 m/s a filter whose drag has the wrong sign refuses good tags; the right one refuses none.
 
@@ -376,6 +378,7 @@ def test_drag_of_the_wrong_sign_would_be_noticed(body: Body) -> None:
     assert off[1] > 3.0 * off[0]
 
 
+@pytest.mark.slow
 def test_wrong_arm_and_trim_are_learned_by_tilting(body: Body) -> None:
     """After pitching up by half a radian and back, the filter knows the moment at every pitch, nose down too: up to 0.45 N m here."""
     x, estimator, rng = start_state(), Estimator(body, P, PERIOD), np.random.default_rng(2)

@@ -73,6 +73,7 @@ PUSH = np.array([0.09, -0.045, 0.02])
 """N m, as from an arm and a trim that were not measured."""
 
 
+@pytest.mark.slow
 def test_robot_that_was_carried_away_still_knows_what_pushes_it(body: Body) -> None:
     """Only the position is lost: otherwise the arm would turn the robot until the moment was learnt again."""
     robot, estimate = rest_pushed(body, 1000)

@@ -142,6 +142,7 @@ def test_power_cut_at_any_step_brings_a_release_up_that_runs(tmp_path: Path, mon
     assert cut >= 25  # every step of a whole flash was cut, including every command that the vehicle ran
 
 
+@pytest.mark.slow
 def test_power_cut_at_any_step_of_going_back_is_made_good_by_the_next_boot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     Machine(tmp_path).install_and_activate(GOOD)
     for cut in range(20):
@@ -270,6 +271,7 @@ def test_trial_that_says_nothing_of_the_release_before_leaves_it_as_it_is(tmp_pa
     assert device.linked(device.previous) == GOOD
 
 
+@pytest.mark.slow
 def test_old_releases_and_wheels_that_nobody_needs_go(tmp_path: Path) -> None:
     machine = Machine(tmp_path)
     for number in range(6):

@@ -25,6 +25,7 @@ def assert_in_control(world: World, station: Client) -> None:
         assert world.robot.state[0] == state
 
 
+@pytest.mark.slow
 def test_random_and_mutated_packets_do_nothing_that_a_valid_sender_could_not() -> None:
     attack = Attack(seed=1)
     attack.run(at_length(1_000_000, 20_000))

@@ -51,6 +51,7 @@ def test_message_interval_sets_the_rate_of_this_link_alone(world: World, client:
     assert client.last("MESSAGE_INTERVAL").interval_us == -1
 
 
+@pytest.mark.slow
 def test_group_of_messages_streams_as_an_ardusubs_client_asks_on_its_link_alone(world: World, client: Client) -> None:
     """REQUEST_DATA_STREAM, by which QGroundControl, MAVProxy (`set streamrate`) and scripts set rates."""
     other = world.client(254)

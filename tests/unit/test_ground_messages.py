@@ -152,6 +152,7 @@ def test_first_pose_is_no_restart() -> None:
     assert client.last("ODOMETRY").reset_counter == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("jump_m", "blind_ticks", "counted"), [(0.0, 0, 0), (1.0, 0, 1), (0.0, 900, 0), (0.0, 1100, 1)])
 def test_estimate_that_is_thrown_away_for_what_tags_say_is_counted(jump_m: float, blind_ticks: int, counted: int) -> None:
     """Where tags contradict it, or give a place to one that was adrift, without tags for more than ten seconds."""

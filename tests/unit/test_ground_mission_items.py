@@ -120,6 +120,7 @@ def test_leg_from_a_stop_to_a_stop_reaches_the_speed_that_was_asked_for_and_no_m
     assert 0.29 < max(speeds) <= 0.3 * (1.0 + 1e-6)
 
 
+@pytest.mark.slow
 def test_lanes_are_flown_at_their_speed_within_the_corridor() -> None:
     """Regression: the same lanes took 3.5 times as long as at their speed throughout, longer than with a stop at each end."""
     places, corridor_m = [np.array([10.0 * (k % 4 in (1, 2)), k // 2, 2.0]) for k in range(5)], 0.1

@@ -194,6 +194,7 @@ def test_flight_that_a_dock_into_another_body_ended_is_not_begun_by_the_undock(t
     assert world.station.jobs() == [] and world.robot.mode[1] == Mode.POSHOLD
 
 
+@pytest.mark.slow
 def test_mission_of_a_robot_that_was_part_of_another_meanwhile_is_not_complete_but_paused() -> None:
     world = World(2)
     client, apart = world.client(), list(world.robot.bodies)

@@ -21,6 +21,7 @@ def start(world: World, client: Client, *items: tuple[float, ...]) -> None:
     client.clear()
 
 
+@pytest.mark.slow
 def test_body_that_is_held_back_reaches_nothing_until_it_is_there(world: World, client: Client) -> None:
     """Regression: with the body ten metres away, its mission was reported to be complete."""
     world.robot.off_plan = HELD_BACK
@@ -37,6 +38,7 @@ def test_body_that_is_held_back_reaches_nothing_until_it_is_there(world: World, 
     assert continued(world, client) == [0, 1, 2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("command", "planned"), [((300, 0, 0), [0, 1, 2]), ((176, 1, 4, 4), [1, 2]), ((193, 1), [1, 2])])
 def test_mission_whose_body_does_not_get_to_an_item_is_planned_anew_when_it_is_started_again(
     command: tuple[float, ...], planned: list[int], world: World, client: Client
@@ -65,6 +67,7 @@ def test_body_that_comes_late_completes_its_mission_when_it_is_there(world: Worl
     assert client.last("MISSION_ITEM_REACHED").seq == 0 and client.texts.endswith("mission complete")
 
 
+@pytest.mark.slow
 def test_item_is_told_once_to_be_late_and_each_that_falls_farther_behind_again(world: World, client: Client) -> None:
     world.robot.off_plan = HELD_BACK
     start(world, client, *(item(i, PLACES[0]) for i in range(3)))
@@ -82,6 +85,7 @@ def test_item_is_told_once_to_be_late_and_each_that_falls_farther_behind_again(w
     assert client.texts.count("mission item 2 is late") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("asked_m", "radius_m"), [(0.0, 0.15), (NAN, 0.15), (-1.0, 0.15), (0.05, 0.05), (0.5, 0.5), (1.0, 0.15), (3.0, 0.15)]
 )
@@ -135,6 +139,7 @@ def test_hold_of_a_body_that_comes_late_begins_when_it_is_there(world: World, cl
     assert [m.seq for m in client.all("MISSION_ITEM_REACHED")][:1] == [0] and not world.station.jobs()
 
 
+@pytest.mark.slow
 def test_delay_without_a_place_is_over_in_time_wherever_the_body_is(world: World, client: Client) -> None:
     world.robot.off_plan = HELD_BACK
     start(world, client, item(0, (0, 0, 0), command=93, frame=2, p=(10, -1, -1, -1)), item(1, PLACES[0]))
@@ -176,6 +181,7 @@ def test_flight_to_one_place_is_told_to_be_late_too(world: World, client: Client
     assert client.texts.count("flight is late: 0.40 m from its place") == 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("anew", [False, True])
 def test_item_of_a_mission_that_is_over_is_not_told_again_in_the_next_one(world: World, client: Client, anew: bool) -> None:
     """Clients take the item that they heard of last for the farthest: the new mission was done before it began."""
@@ -191,6 +197,7 @@ def test_item_of_a_mission_that_is_over_is_not_told_again_in_the_next_one(world:
     assert not client.all("MISSION_ITEM_REACHED")
 
 
+@pytest.mark.slow
 def test_mission_that_was_replaced_in_flight_is_not_told_to_be_late(world: World, client: Client) -> None:
     world.robot.off_plan = HELD_BACK
     start(world, client, item(0, PLACES[0]))

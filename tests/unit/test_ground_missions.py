@@ -12,6 +12,7 @@ from tests.unit.ground_requests import NAN
 from tests.unit.ground_world import Client, World
 
 
+@pytest.mark.slow
 def test_mission_starts_by_mode_holds_first_and_tracks_the_plan(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     job = fly(world, client)
@@ -64,6 +65,7 @@ def test_mission_that_goes_on_is_as_fast_as_before_it_was_paused(world: World, c
     assert [(leg.sequence, leg.speed_m_s) for leg in job.legs] == [(2, pytest.approx(0.3))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("kind", "asked", "left"), [
     ("COMMAND_LONG", (193, 0, 0, 0, 0, 0, 0, 0, 0), [1, 3]),
     ("COMMAND_INT", (6, 192, 0, 0, -1, 0, 0, NAN, 302084000, 1201614000, -0.4), [1, 3]),
@@ -84,6 +86,7 @@ def test_rounds_that_were_flown_before_a_pause_are_not_flown_again(
     assert continued(world, client) == left
 
 
+@pytest.mark.slow
 def test_mission_that_is_paused_in_its_last_hold_goes_on_with_that_alone(world: World, client: Client) -> None:
     jump = item(2, (0, 0, 0), command=177, frame=2, p=(0, 1, 0, 0))
     upload(world, client, [item(0, PLACES[0]), item(1, PLACES[1], p=(20, 0, 0, NAN)), jump])
@@ -220,6 +223,7 @@ def test_start_that_comes_again_because_its_answer_was_lost_does_not_begin_the_m
         assert job.legs[0].sequence == parameters[0], "another item, or a jump to the same one, is gone to"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("again", "planned"), [((300, 0), [0, 1, 2]), ((193, 1), [1, 2])])
 @pytest.mark.parametrize("taken_by", [(193, 0), (21,), (17,), (176, 1, 1)])
 def test_start_right_behind_what_takes_the_body_for_something_else_is_flown(
@@ -248,6 +252,7 @@ def test_start_that_comes_again_behind_a_mode_that_is_refused_does_not_begin_the
     assert world.station.jobs() == [] and world.robot.mode[0] == Mode.AUTO
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("by_message", [False, True])
 @pytest.mark.parametrize("flown_ticks", [0, 10, 500])
 def test_jump_that_comes_again_because_its_answer_was_lost_flies_on(
@@ -380,6 +385,7 @@ def test_items_at_one_place_are_all_told_to_be_reached(world: World, client: Cli
     assert [m.seq for m in client.all("MISSION_ITEM_REACHED")] == [0, 1, 2, 2, 2], "the last is told again"
 
 
+@pytest.mark.slow
 def test_mission_is_complete_once_its_last_hold_is_over(world: World, client: Client) -> None:
     upload(world, client, [item(0, PLACES[0]), item(1, PLACES[1], p=(5, 0, 0, NAN))])
     fly(world, client)
@@ -390,6 +396,7 @@ def test_mission_is_complete_once_its_last_hold_is_over(world: World, client: Cl
     assert client.last("MISSION_CURRENT").mission_state == mavlink.MISSION_STATE_COMPLETE
 
 
+@pytest.mark.slow
 def test_mission_that_is_done_is_flown_again_from_its_beginning(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     fly(world, client)
@@ -407,6 +414,7 @@ def test_mission_goes_on_when_every_client_is_gone(world: World, client: Client)
     assert world.station.services[1].system.subject.progress.current == 2
 
 
+@pytest.mark.slow
 def test_mission_that_came_while_another_flew_is_started_from_its_beginning(world: World, client: Client) -> None:
     upload(world, client, [item(i, place) for i, place in enumerate(PLACES)])
     fly(world, client)

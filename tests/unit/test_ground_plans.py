@@ -95,6 +95,7 @@ def test_planning_process_that_is_still_importing_hears_no_press_of_ctrl_c(at_th
     assert blocked == {signal.SIGINT} and signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, [])
 
 
+@pytest.mark.slow
 def test_robot_that_is_stopped_waits_for_no_plan_that_is_being_made() -> None:
     """The service manager allows the robot five seconds, then kills the process, which tears its log."""
     firmware = firmware_of()

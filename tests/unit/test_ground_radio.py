@@ -177,6 +177,7 @@ class SlowLink:
         """Does nothing: there is nothing to release."""
 
 
+@pytest.mark.slow
 def test_radio_slower_than_what_streams_gets_less_of_everything_and_every_heartbeat_and_text(monkeypatch: pytest.MonkeyPatch) -> None:
     radio, robot = SlowLink(57.6), Robot(modules=4)  # 57,600 Bd at 100 Hz
     monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address, warn: radio)

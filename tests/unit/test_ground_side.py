@@ -219,6 +219,7 @@ def test_ground_side_in_which_something_fails_says_so_once_and_goes_on_to_hear_a
     assert type(side.error).__name__ in said.get_nowait() and said.empty()
 
 
+@pytest.mark.slow
 def test_link_that_is_not_there_yet_is_said_and_keeps_no_other_from_its_work_and_is_said_once_it_is(tmp_path: Path) -> None:
     said: Queue[str] = Queue()
     config, (ours, theirs) = GroundConfig(links=(f"{tmp_path}/radio,57600", "udpin:127.0.0.1:0")), pty.openpty()

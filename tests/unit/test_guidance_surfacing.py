@@ -19,6 +19,7 @@ LIFT_N = Parameters().steering.surface_n_per_kg * 15.5
 """Of a module: 9.3 kg of robot and entrained water, 6.2 kg of added mass."""
 
 
+@pytest.mark.slow
 def test_surfacing_robot_rises_levels_and_stays_up() -> None:
     flight = Flight()
     flight.estimate = estimate(q=from_euler(0.4, -0.6, 1.0))
@@ -67,6 +68,7 @@ def test_robot_that_believes_to_be_at_the_surface_is_lifted_all_the_same(depth_m
     np.testing.assert_allclose(lift_w, [0.0, 0.0, -0.5 * LIFT_N], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_stacked_robot_stays_with_its_highest_module_at_the_surface() -> None:
     """With its centre of mass there it lifted half a module out of the water, with all the power that its supply had."""
     stack = assemble([(0, 0, 0), (0, 0, -1), (0, 0, 1)], [0] * 3, [load_vehicle("modcube")] * 3, [0, 1, 2])
@@ -76,6 +78,7 @@ def test_stacked_robot_stays_with_its_highest_module_at_the_surface() -> None:
     assert rotate(flight.estimate.q_wb, flight.wrenches[-1][:3].copy())[2] == pytest.approx(-0.5 * LIFT_N * 3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "depth_m"), [("modcube", 0.12), ("bluerov2", 0.127), ("girona500", 0.5)])
 def test_tall_robot_comes_up_as_far_as_the_water_carries_its_hull(name: str, depth_m: float) -> None:
     """A robot of 0.8 m was to come up to 0.12 m too: it held a fifth of a kilonewton of hull out of the water until its battery was low."""

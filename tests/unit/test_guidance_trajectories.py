@@ -77,6 +77,7 @@ def test_speed_that_the_body_cannot_make_leads_no_set_point_away_that_it_would_r
     assert flight.setpoints[-1].p_wb[0] < LEASH_M + 0.1 and np.abs(flight.setpoints[-1].v_w).max() < 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("silence_s", "north_m"), [(60.0, 0.0), (0.1, 3.0)])
 def test_point_of_long_ago_is_no_place_to_go_to_when_the_mode_is_entered(silence_s: float, north_m: float) -> None:
     flight = Flight()
@@ -94,6 +95,7 @@ def test_single_point_is_flown_to_without_a_stream() -> None:
     assert flight.run(15.0).p_wb[2] == pytest.approx(2.0, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_place_that_is_moved_is_the_one_that_the_robot_is_on_its_way_to() -> None:
     flight = Flight()
     flight.do(Effect.HOLD_AT, Mode.POSHOLD, rest_at(np.array([1.0, 0.0, 1.0]), LEVEL))
@@ -104,12 +106,14 @@ def test_place_that_is_moved_is_the_one_that_the_robot_is_on_its_way_to() -> Non
     np.testing.assert_allclose(flight.run(40.0).p_wb, [1.0, 0.0, 1.2], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_place_is_not_moved_out_of_the_fence() -> None:
     flight = Flight(Parameters().replace("fence.east_m", 2.0))
     flight.guidance.move_by(np.array([0.0, 2.3, 0.0]))
     assert flight.run(60.0).p_wb[1] == pytest.approx(2.0, abs=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("point", "kept"),
     [((9.0, 0.0, 1.0), (2.0, 0.0, 1.0)), ((0.0, -9.0, 1.0), (0.0, -3.0, 1.0)), ((0.0, 0.0, 30.0), (0.0, 0.0, 4.0))],

@@ -402,6 +402,7 @@ def test_tags_that_the_papers_estimator_accepts_count_though_it_tells_no_innovat
     assert health.rejected_share < 0.01 and health.nis_ratio == 1.0
 
 
+@pytest.mark.slow
 def test_few_flips_in_a_long_flight_of_the_papers_estimator_stay_few() -> None:
     estimator, bench = TagOnlyEstimator(BODY, Parameters().estimation, TICK_NS), MonitorBench()
     flip, worst = exp(np.array([0.8, 0.0, 0.0])), 0.0

@@ -43,6 +43,7 @@ def flown(monkeypatch: pytest.MonkeyPatch) -> list[tuple[object, ...]]:
     return asked
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("option", [*OFF, ["--draw", "1"]], ids=lambda option: str(option[0]))
 def test_matrix_of_faults_refuses_what_it_does_not_take(
     option: list[str], flown: list[object], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -61,6 +62,7 @@ def test_matrix_of_faults_takes_the_others(flown: list[object], tmp_path: Path, 
     assert flown == [(3, tmp_path, 5)]
 
 
+@pytest.mark.slow
 def test_interrupted_campaign_says_that_it_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -72,6 +74,7 @@ def test_interrupted_campaign_says_that_it_goes_on(
     assert capsys.readouterr().err == "modcube: interrupted; the same command goes on where it was\n"
 
 
+@pytest.mark.slow
 def test_campaign_that_is_terminated_from_elsewhere_says_that_it_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -85,6 +88,7 @@ def test_campaign_that_is_terminated_from_elsewhere_says_that_it_goes_on(
     assert capsys.readouterr().err == "modcube: interrupted; the same command goes on where it was\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bus", "why"), [
     ("socketcan:can9", "there is no such interface"), ("slcan:/dev/ttyNO", "does not reach another process"),
     ("virtual:x", "does not reach another process"),
@@ -98,12 +102,14 @@ def test_flight_in_two_processes_refuses_a_bus_that_is_none_in_one_line(
     assert line.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_help_names_every_bus_that_a_flight_takes(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert status_of(["run", "--help"], monkeypatch) == 0
     shown = capsys.readouterr().out
     assert [kind for kind in ("virtual:", "udp:", "socketcan:", "slcan:") if kind not in shown] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "old", "new", "why"), [
     ("mobius-2", '"modcube"', '"bluerov2"', ":11: module[0]: no docked face joins module 2 to module 1"),
     ("hover", "centre_m = [0.0", "centre_m = [9.0", ":18: task: the path leaves the tank, a box of 1.3 x 1.2 x 0.76 m, after 0 s"),
@@ -117,6 +123,7 @@ def test_scenario_that_no_flight_can_follow_is_refused_with_file_and_line(
     assert f"{tmp_path / 'own.toml'}{why}" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", [["run", "hover"], ["campaign", "hover"], ["plant", "hover", "--bus", "udp:239.74.163.9:43119"]])
 def test_folder_without_a_name_is_refused(
     command: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -129,6 +136,7 @@ def test_folder_without_a_name_is_refused(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_plant_alone_refuses_a_bus_that_nobody_else_reaches(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     served: list[object] = []
     monkeypatch.setattr(hil.plant_process, "serve_until_signal", lambda *arguments: served.append(arguments))
@@ -150,6 +158,7 @@ def test_plant_alone_serves_the_modules_of_its_seed(monkeypatch: pytest.MonkeyPa
     assert min(served) > 1
 
 
+@pytest.mark.slow
 def test_plant_alone_takes_another_vehicle_and_holds_it_against_the_scenario(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -164,6 +173,7 @@ def test_plant_alone_takes_another_vehicle_and_holds_it_against_the_scenario(
     assert "into the wall" in too_large and too_large.endswith("(--vehicle bluerov2)") and served == ["bluerov2"]
 
 
+@pytest.mark.slow
 def test_rate_that_the_plant_cannot_follow_is_refused_with_those_that_it_can(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -174,6 +184,7 @@ def test_rate_that_the_plant_cannot_follow_is_refused_with_those_that_it_can(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_what_only_lockstep_can_break_is_refused_in_real_time(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -199,6 +210,7 @@ NORTH = "x_m,y_m,z_m,duration_s\n0,0,0.38,\n0.1,north,0.38,5\n"
 REALTIME = pytest.param(["--realtime", "--bus", "udp:239.74.163.9:43127"], marks=pytest.mark.slow)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("realtime", [[], REALTIME], ids=["lockstep", "realtime"])
 @pytest.mark.parametrize(
     ("old", "new", "options", "why"),
@@ -239,6 +251,7 @@ def with_mesh(mesh: str) -> str:
     return vehicle.read_text(encoding="utf-8").replace("[hull]", f'[hull]\nmesh = "{mesh}"')
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("vehicle", ["nautilus", "none.toml", "no_mesh.toml"])
 @pytest.mark.parametrize("command", [["run"], ["campaign", "--jobs", "1"]], ids=["run", "campaign"])
 def test_refused_vehicle_leaves_no_folder(
@@ -253,12 +266,14 @@ def test_refused_vehicle_leaves_no_folder(
         assert sorted(path.name for path in tmp_path.rglob("*")) == ["no_mesh.toml", "there"]
 
 
+@pytest.mark.slow
 def test_plant_whose_bus_is_refused_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("signal.signal", lambda *_: None)
     assert status_of(["plant", "hover", "--bus", "socketcan:can9", "--out", str(tmp_path / "new" / "run")], monkeypatch) == 2
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("command", "name", "run"),
     [
@@ -284,6 +299,7 @@ def test_files_that_no_run_left_are_not_written_over(
     assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, '{"mine": true}')]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("others", [["README.md"], ["campaign.json", "trials.csv", "trials.jsonl"]], ids=["documents", "campaign"])
 def test_flight_is_not_scattered_among_other_files(
     others: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -299,6 +315,7 @@ def test_flight_is_not_scattered_among_other_files(
     assert sorted(path.name for path in tmp_path.iterdir()) == others
 
 
+@pytest.mark.slow
 def test_trials_that_are_none_are_not_written_over(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

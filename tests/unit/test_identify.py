@@ -34,6 +34,7 @@ def test_noise_of_a_sensor_is_found_beside_its_motion() -> None:
     assert motion.noise_of(moved) == pytest.approx(0.002, rel=0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_m", [(0.0, 0.0, 0.0), (0.03, -0.02, 0.04)])
 def test_motion_is_that_of_the_centre_of_mass_wherever_the_imu_is(at_m: tuple[float, float, float]) -> None:
     """A centre that stands still while the body turns about it; the tags' positions are poor, so the accelerometer counts."""
@@ -216,6 +217,7 @@ def made_up(
     return model.Equations(recording, motion.Motion(below + swum, swum, turned, 0.5 * swum), vehicle.curve, weight)
 
 
+@pytest.mark.slow
 def test_gusts_are_found_beside_the_drag_and_leave_it_alone() -> None:
     flight, rng = made_up(), np.random.default_rng(1)
     x = model.initial_values(flight.vehicle) | {"current": np.array([0.04, 0.0, -0.03]), "bias": np.zeros(3)}

@@ -188,6 +188,7 @@ def test_missing_or_unreadable_log_says_nothing(tmp_path: Path) -> None:
     assert in_flight(Path(__file__)) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0x00, 0x7F, 0xFF])
 def test_start_of_a_log_may_be_spoilt_anywhere(tmp_path: Path, value: int) -> None:
     """A wrong bit in a length makes it astronomical; a process that crashed on it would crash at every start."""
@@ -233,6 +234,7 @@ JOINT = frozenset({(0, 0), (1, 1)})
 HOLDS, ALL = "the process before ended in flight", {0, 1, 2}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("before", "fleet", "hold", "rearm", "armed", "told"), [
     (FLOWN, FLEET, False, False, set(), []),
     (FLOWN, FLEET, False, True, {0, 2}, [HOLDS]),

@@ -232,6 +232,7 @@ def test_imus_around_the_centre_of_mass_are_averaged_and_nothing_else(body: Body
         assert turned.tobytes() == expected.tobytes()
 
 
+@pytest.mark.slow
 def test_noise_of_the_gyro_hardly_reaches_the_specific_force_of_a_body_at_rest(body: Body) -> None:
     measurements, rng = Measurements(body, PERIOD), np.random.default_rng(8)
     accel = [turning(measurements, (1,), np.zeros(3), np.zeros(3), rng).accel for _ in range(2000)]

@@ -106,6 +106,7 @@ def test_every_tick_of_the_trajectory_counts(tmp_path: Path) -> None:
     assert (metrics["supply_power_w"], metrics["wrench_margin_min"]) == (POWER_W, MARGIN)
 
 
+@pytest.mark.slow
 def test_honest_filter_is_consistent_in_all_six_axes(tmp_path: Path) -> None:
     metrics = flight_metrics(spiral_of(tmp_path, duration_s=20.0))
     assert 0.85 < metrics["nis_mean"] < 1.15

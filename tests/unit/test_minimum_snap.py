@@ -102,6 +102,7 @@ A, B, C = (np.array(p, dtype=float) for p in ((0, 0, 0.5), (1, 0, 0.5), (1, 1, 0
 STOP = {"stop": True}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("total_s", [None, 20.0])
 @pytest.mark.parametrize(
     ("repeated", "once"),
@@ -121,6 +122,7 @@ def test_waypoint_that_is_given_twice_is_flown_as_one(repeated: list, once: list
     np.testing.assert_array_equal(found.coefficients, wanted.coefficients)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stop", [False, True])
 @pytest.mark.parametrize("off_m", [1e-5, 1e-4, 1e-3])
 def test_waypoints_that_are_nearly_one_are_flown_in_a_time_that_is_not_absurd(off_m: float, stop: bool) -> None:

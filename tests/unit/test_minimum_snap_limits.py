@@ -24,6 +24,7 @@ def one() -> Body:
     return assemble_vehicle(load_vehicle("modcube"))
 
 
+@pytest.mark.slow
 def test_limited_path_of_a_hundred_waypoints_keeps_limits_and_waypoints() -> None:
     points = walk(100)
     waypoints = [Waypoint(p) for p in points]
@@ -193,6 +194,7 @@ def test_path_that_stops_at_every_waypoint_says_which_limit_it_cannot_keep() -> 
     assert f"between waypoints {refused.value.place.waypoint} and" in str(refused.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [3, 9, 11, 17, 19])
 def test_pieces_whose_durations_differ_by_up_to_64_times_keep_their_velocity_without_more_time(seed: int) -> None:
     """They took 1.6 to 55 times as long as asked, and went up to 1.4 % over a velocity near the ends of long pieces."""
@@ -278,6 +280,7 @@ def test_turning_alone_bounds_the_time_of_a_path_that_moves_too() -> None:
     assert np.linalg.norm(grid[..., 10:13], axis=-1).max() == pytest.approx(0.5, rel=0.01)
 
 
+@pytest.mark.slow
 def test_acceleration_keeps_its_limit_between_the_points_where_it_is_checked() -> None:
     waypoints, limits = [Waypoint(p) for p in walk(5, seed=2)], Limits(acceleration=np.full(3, 0.05), corridor_m=0.2)
     largest = np.abs(plan(waypoints, None, limits).grid(1000)[..., 13:16]).max()
@@ -293,6 +296,7 @@ def test_turning_keeps_its_limit_between_the_points_where_it_is_checked(limits: 
     assert 0.99 * bound < max(largest) <= bound
 
 
+@pytest.mark.slow
 def test_path_is_looked_at_in_no_shorter_pieces_than_time_can_tell() -> None:
     """A piece of a day beside one of a nanosecond throws the quaternion far off, and it returns within no time at the end of the piece."""
     found = plan(poses(4), [1e-9, 1e5, 1.0], stretch=False)

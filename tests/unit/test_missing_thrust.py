@@ -36,6 +36,7 @@ def water() -> Water:
     return Water()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thruster", range(8))
 @pytest.mark.parametrize("gain", [0.0, -1.0], ids=["fakes its speed", "reversed"])
 def test_lying_thruster_is_found_within_two_seconds(thruster: int, gain: float) -> None:
@@ -103,6 +104,7 @@ def test_lying_thruster_is_found_although_frames_are_lost() -> None:
     assert [words for _, words in water.run(2.0)] == ["thruster 1 of module 0 does not push as it says: left out"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_healthy_robot_that_is_pushed_about_has_no_liar(seed: int) -> None:
     """Forces that change twice a second, realistic errors of gains and deadbands, and a disturbance that turns with the body."""
@@ -114,6 +116,7 @@ def test_healthy_robot_that_is_pushed_about_has_no_liar(seed: int) -> None:
         assert water.run(0.5, PUSH + BODY.thrusters.pinv @ wrench) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thruster", range(8))
 def test_weak_thruster_whose_speed_says_so_does_not_lie_and_one_that_says_too_little_does(thruster: int) -> None:
     """Half the force goes with 71 % of the speed."""

@@ -180,6 +180,7 @@ def test_only_the_bodies_that_were_meant_are_armed() -> None:
     assert flight.arms == [1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("ticks", "arms"), [(MINUTE - 1, [0]), (MINUTE, [])])
 def test_flight_that_was_broken_off_is_taken_up_within_a_minute_or_never(ticks: int, arms: list[int]) -> None:
     """An hour later, the robot may be in somebody's hands when a camera sees its first tag."""
@@ -192,6 +193,7 @@ def test_flight_that_was_broken_off_is_taken_up_within_a_minute_or_never(ticks: 
     assert flight.said == ([] if arms else ["not armed again: the vehicle could not within 60 s (REARM)"])
 
 
+@pytest.mark.slow
 def test_flight_that_may_not_be_taken_up_is_tried_for_a_minute() -> None:
     flight = Flight(limit_s=REARM_S)
     flight.robot.refuse[Action.ARM] = "leak"
@@ -200,6 +202,7 @@ def test_flight_that_may_not_be_taken_up_is_tried_for_a_minute() -> None:
     assert len(flight.said) == 1
 
 
+@pytest.mark.slow
 def test_order_to_hold_stays_without_limit() -> None:
     flight = Flight()
     flight.robot.ready = False

@@ -50,6 +50,7 @@ def test_paper_estimator_follows_a_steady_turn(body: Body) -> None:
     np.testing.assert_allclose(estimate.nu[3:], rate, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_paper_estimator_does_not_make_up_for_delay(body: Body) -> None:
     """The filter treats a picture as current: 50 ms at 0.2 m/s lag by 10 mm."""
     estimator = TagOnlyEstimator(body, PAPER, PERIOD)
@@ -129,6 +130,7 @@ def test_paper_estimator_that_goes_on_in_another_estimates_the_same(body: Body) 
             np.testing.assert_allclose(getattr(goes_on, name), getattr(stays, name), atol=1e-10)
 
 
+@pytest.mark.slow
 def test_paper_estimator_of_a_parted_body_hardly_jumps(body: Body) -> None:
     """The uncertainty of the magnets' push is added to the filter's own; a metre in its place makes the filter jump by 0.4 m/s."""
     peaks = []

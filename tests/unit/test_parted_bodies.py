@@ -33,6 +33,7 @@ def test_parts_of_a_broken_body_are_as_broken_as_it_was() -> None:
     assert tank.run(0.1, Request(Action.ARM, 0)).records[0].state == State.DISARMED, "a hull that fails flies no more"
 
 
+@pytest.mark.slow
 def test_body_that_was_prepared_with_other_gains_flies_with_those_of_now() -> None:
     tank = FaultyTank(RING[:2], delay=30)
     tank.fly()
@@ -59,6 +60,7 @@ def test_magnets_of_a_joint_rest_when_their_account_is_empty_and_take_power_whil
     assert not pulling & set(resting) and tank.pipeline.formation.pipelines[0].limiter.magnets[0].power_w == 0.0
 
 
+@pytest.mark.slow
 def test_parted_modules_magnets_keep_their_accounts() -> None:
     tank = FaultyTank(RING[:2], Parameters().replace("limiter.relay_on_s", 60.0).replace("limiter.relay_duty", 0.01))
     tank.fly()
@@ -86,6 +88,7 @@ def test_joint_that_holds_for_a_moment_and_is_lost_again_is_parted_by_another_pl
     assert tank.shape == [(0,), (1,)]
 
 
+@pytest.mark.slow
 def test_disarming_a_body_in_the_tick_in_which_it_parts_reaches_both_pieces() -> None:
     tank = FaultyTank(RING[:2])
     tank.fly()
@@ -99,6 +102,7 @@ def test_disarming_a_body_in_the_tick_in_which_it_parts_reaches_both_pieces() ->
     assert not np.any([module.thrusters for module in outputs.modules])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("after_s", "reaches"), [(0.01, 2), (4.9, 2), (5.1, 1)])
 def test_disarming_a_body_that_has_broken_apart_reaches_all_its_pieces_for_five_seconds(after_s: float, reaches: int) -> None:
     tank = FaultyTank(RING[:2])

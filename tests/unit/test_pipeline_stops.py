@@ -61,6 +61,7 @@ def test_robot_stops_when_a_module_says_that_an_e_stop_holds_it_and_is_armed_onc
     assert tank.run(DT, Request(Action.ARM)).modules[0].armed
 
 
+@pytest.mark.slow
 def test_motor_test_of_a_disarmed_robot_turns_one_thruster_and_disarms(tank: Tank) -> None:
     tank.run(1.0)
     first = len(tank.outputs)
@@ -100,6 +101,7 @@ def test_tested_thruster_gives_the_wanted_share_of_its_side_and_never_more_than_
     np.testing.assert_allclose(record.thrust.force_n, force, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_robot_that_lost_an_axis_trusts_its_thrusters_again_once_it_is_disarmed(tank: Tank) -> None:
     """A thruster that no longer turns is found again within half a second of flight."""
     tank.run(0.5)
@@ -114,6 +116,7 @@ def test_robot_that_lost_an_axis_trusts_its_thrusters_again_once_it_is_disarmed(
     assert tank.outputs[-1].modules[0].thrusters.all(), "and they are used again"
 
 
+@pytest.mark.slow
 def test_warning_of_a_lost_thruster_ends_in_flight_once_the_thruster_is_acquitted(tank: Tank) -> None:
     """It stayed on until the robot was disarmed, although every thruster was in use again."""
     tank.run(0.5)
@@ -131,6 +134,7 @@ def test_warning_of_a_lost_thruster_ends_in_flight_once_the_thruster_is_acquitte
     assert pipeline.supervisor.armed and not pipeline.supervisor.is_on("thruster_lost")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gap_s", "is_armed"), [(0.05, True), (0.5, True), (1.99, True), (2.02, False), (5.0, False), (86_400.0, False)])
 def test_robot_whose_process_was_stopped_comes_back_disarmed(gap_s: float, is_armed: bool) -> None:
     """By SIGSTOP, or with its computer. Every module answers the first tick after that: nothing else tells of the time that is missing."""

@@ -93,6 +93,7 @@ def about_com(scenario: Scenario) -> tuple[np.ndarray, np.ndarray]:
     return h.T @ (arrays.rigid[0] + arrays.added[0]) @ h, columns.T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(4))
 def test_calm_plant_and_controller_agree_on_any_shape(seed: int) -> None:
     scenario = load_scenario("polycube").for_seed(seed).with_calm_world()

@@ -105,6 +105,7 @@ def test_buoyant_module_rises_along_the_closed_form() -> None:
         assert moved == pytest.approx(side * terminal / rate * math.log(math.cosh(rate * seconds)), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_drifting_module_ends_up_moving_with_the_current() -> None:
     world = ocean(vehicle(), current_m_s=0.2)
     run(world, 200.0)
@@ -166,6 +167,7 @@ def test_heavy_module_comes_to_rest_on_the_bottom() -> None:
     assert truth.p_wm[2] == pytest.approx(0.76 - 0.105 + 0.5 / 4 / spec.wall_stiffness, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_light_module_floats_at_the_surface() -> None:
     spec = WorldSpec(**{**CALM, "buoyancy_error_n": 0.5})
     seed = next(s for s in range(20) if not sinks(spec, s))

@@ -102,6 +102,7 @@ def stored(world: World) -> float:
     return 2.0 * DockSpec().contact_n_m3 * ConvexHull(corners - inside).volume
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12))
 def test_force_and_moment_between_hulls_are_the_slope_of_the_energy_stored(seed: int) -> None:
     rng = np.random.default_rng(seed)

@@ -128,6 +128,7 @@ def lasting(fault: Fault, at_s: float, until_s: float) -> Fault:
     return dataclasses.replace(fault, at_s=at_s, until_s=until_s)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", SINGLE, ids=lambda fault: f"{fault.kind}-{fault.module}")
 def test_what_broke_is_whole_again_when_the_fault_is_over(fault: Fault) -> None:
     nodes = nodes_with(lasting(fault, 0.02, 0.05), scenario="dock")
@@ -141,6 +142,7 @@ PAIRS = [pair for pair in itertools.permutations(SINGLE, 2) if len({fault.kind.s
 """Ordered pairs of faults of the same parts."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "second"), PAIRS)
 def test_fault_that_begins_or_ends_leaves_another_one_as_it_was(first: Fault, second: Fault) -> None:
     """Whichever begins or ends first, the state is that of the faults that are on."""
@@ -228,6 +230,7 @@ def depths(*faults: Fault, ticks: int = 100) -> np.ndarray:
     return (pa - 101_325.0) / 9_790.0
 
 
+@pytest.mark.slow
 def test_pressure_jumps_and_drifts_from_its_time_on_and_both_add_up() -> None:
     whole = depths()
     jumped, drifted = depths(Fault(kind="pressure_jump", value=0.3, at_s=0.5)), depths(Fault(kind="pressure_drift", value=-0.2, at_s=0.5))
@@ -271,6 +274,7 @@ def sighted(*faults: Fault, scenario: str) -> dict[int, np.ndarray]:
     return {number: np.array([r.values[:3] for r in received if r.number == number]) for number in (1, 2)}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "off_m"),
     [
@@ -287,6 +291,7 @@ def test_module_that_a_carried_camera_sees_is_off_by_a_fault_once(fault: Fault, 
         np.testing.assert_allclose(np.linalg.norm(off, axis=1), expected, atol=0.0015)
 
 
+@pytest.mark.slow
 def test_tag_fault_is_of_the_module_that_it_names() -> None:
     jumped = sighted(Fault(kind="tag_jump", module=2, value=0.3), scenario="dock")
     whole = sighted(scenario="dock")
@@ -305,6 +310,7 @@ def test_that_share_of_the_tags_is_flipped() -> None:
     assert np.mean(turned) == pytest.approx(0.3, abs=0.1)
 
 
+@pytest.mark.slow
 def test_flipped_tags_turn_and_stay_in_place() -> None:
     np.testing.assert_array_equal(tags(Fault(kind="tag_flip", value=1.0)), tags())
     flipped, straight = (

@@ -98,6 +98,7 @@ def test_module_at_rest_reports_gravity_pressure_and_pose() -> None:
     assert named(frames, "POWER").values[0] == pytest.approx(12.0)
 
 
+@pytest.mark.slow
 def test_tag_frames_say_when_the_picture_was_taken_and_come_40_ms_late() -> None:
     scenario = load_scenario("spiral")
     nodes, found = nodes_of(scenario), 0
@@ -172,6 +173,7 @@ def test_error_is_reported_once() -> None:
     assert [named(frames, "MCU_STATUS").values[2] for frames in answers] == [0, 1, 0, 0]
 
 
+@pytest.mark.slow
 def test_slow_frames_count_by_one() -> None:
     nodes, receiver = nodes_of(calm()), Receiver(CODEC)
     counters = collections.defaultdict(list)
@@ -334,6 +336,7 @@ def test_spiral_stays_clear_of_the_walls() -> None:
     assert np.hypot(*(start - task.centre_m)[:2]) == pytest.approx(task.radius_m) and start[2] == task.centre_m[2]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", scenario_names())
 def test_scenario_carries_its_own_name_and_can_be_built(name: str) -> None:
     scenario = load_scenario(name)

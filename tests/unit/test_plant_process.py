@@ -40,6 +40,7 @@ def tick_of(k: int) -> list[Frame]:
     return [sync(k), *thrust(0.0, DISARMED, k), dock([0] * 6, k)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "fault",
     [

@@ -242,6 +242,7 @@ def test_gusts_have_the_wanted_strength_and_smoothness() -> None:
     np.testing.assert_allclose(np.diff(flow, axis=0).std(axis=0) / 0.01, 0.015 / math.sqrt(2.0 * 0.5), rtol=0.1)
 
 
+@pytest.mark.slow
 def test_gusts_begin_as_they_go_on() -> None:
     """Over many seeds, gust and gust target have the stationary covariance of two lags driven by white noise (Lyapunov, by scipy)."""
     sigma, t1, t2 = 0.3, 5.0, 1.0

@@ -86,6 +86,7 @@ class TestSlcan(PortSuite):
     def address_pair(self, cable):
         return cable.addresses
 
+    @pytest.mark.slow
     def test_adapter_serves_one_process_and_the_next_one_when_it_is_done(self, pair, cable):
         """A second process would switch the channel off on opening; and its SYNC would go unnoticed, as an adapter does not echo."""
         one, other = pair
@@ -196,6 +197,7 @@ class TestSlcan(PortSuite):
         other.close()
         again.unplug()
 
+    @pytest.mark.slow
     def test_adapter_that_is_reset_while_its_device_stays_is_opened_again(self, address_pair, cable):
         """Regression: it forgets that its channel is open, reports no error, and was silent for ever."""
         with open_port(address_pair[0], reader=True, now_ns=time.monotonic_ns) as one, open_port(address_pair[1]) as other:
@@ -209,6 +211,7 @@ class TestSlcan(PortSuite):
                 assert receive(receiver, 1) == [FRAMES[2]]
             assert not faults(one)
 
+    @pytest.mark.slow
     def test_adapter_that_takes_no_more_is_counted_and_tears_no_frame(self, pair, cable):
         one, other = pair
         cable.stop()

@@ -197,6 +197,7 @@ def test_mesh_that_is_not_where_the_hull_is_is_refused(turn: np.ndarray, shift_m
 # ---------------------------------------------------------------- the paper's sampling
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cells", [ONE, LINE, QUAD, ELBOW], ids=["one", "line", "2x2", "elbow"])
 def test_alpha_shape_on_a_lattice_with_boundary_is_within_one_percent(cells: Cells) -> None:
     directions = DIRECTIONS[:: 6 * len(cells)]
@@ -208,6 +209,7 @@ def test_alpha_shape_on_a_lattice_with_boundary_is_within_one_percent(cells: Cel
     np.testing.assert_allclose(sampled_centres, centres, atol=0.002)
 
 
+@pytest.mark.slow
 def test_random_interior_points_underestimate_the_area() -> None:
     exact = areas_and_centroids(solids(ONE), DIRECTIONS[::8])[0]
     sampled = alpha.random_method(seed=1)(solids(ONE), DIRECTIONS[::8])[0]

@@ -137,6 +137,7 @@ def test_transition_is_second_order_in_the_step(body: Body) -> None:
     assert errors[2] < 0.35 * errors[1]
 
 
+@pytest.mark.slow
 def test_step_follows_the_equations_of_motion(body: Body) -> None:
     """Half a second in ticks against an adaptive solver of the same equations."""
     x = state(2)

@@ -136,6 +136,7 @@ def test_torn_end_of_the_signals_leaves_the_ticks_before_it(tmp_path: Path, cut:
     assert last_bodies(tmp_path / SIGNAL_LOG) == {0: BodyEnd(ARMED, int(Mode.MOTOR_DETECT))}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [0x00, 0x7F, 0xFF])
 def test_signals_may_be_spoilt_anywhere(tmp_path: Path, value: int) -> None:
     """A process that crashed on a wrong bit would crash at every start."""

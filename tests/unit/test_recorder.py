@@ -156,6 +156,7 @@ def test_flushed_log_loses_nothing_when_the_process_is_killed(tmp_path: Path) ->
     assert len((tmp_path / CAN_LOG).read_text().splitlines()) == 400
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("read", [is_closed, damaged_at, lambda path: sum(1 for _ in read_messages(path))])
 def test_long_signal_log_is_read_without_being_held_in_memory(read: Callable[[Path], object], tmp_path: Path) -> None:
     """A day of one module is 8 GB."""

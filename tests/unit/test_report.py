@@ -88,6 +88,7 @@ def test_every_plot_is_written_and_has_a_caption(flight: Flight, tmp_path: Path)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in paths)
 
 
+@pytest.mark.slow
 def test_grey_of_every_plot_over_time_is_in_its_legend(flight: Flight) -> None:
     figures = overview(flight, WINDOW, TANK_M, 20.92), thrusters(flight, WINDOW, np.array([-8.0, 10.0]))
     for figure in (*figures, *(draw(flight, WINDOW) for draw in (position, attitude, estimate, disturbance))):
@@ -98,6 +99,7 @@ def test_grey_of_every_plot_over_time_is_in_its_legend(flight: Flight) -> None:
         pyplot.close(figure)
 
 
+@pytest.mark.slow
 def test_panel_says_why_it_is_empty_where_the_filter_has_nothing_to_show(flight: Flight) -> None:
     """The paper's filter reports no innovations and estimates no disturbance."""
     silent = {name: np.zeros_like(flight.firmware[name]) for name in ("nis", "nis_dof", "force_w", "moment_b")}
@@ -176,6 +178,7 @@ def test_report_of_a_dock_has_its_outcome_as_headline_and_no_rmse_that_nobody_as
         assert ("<b>17.90 mm</b>" in page) == (limit is not near)
 
 
+@pytest.mark.slow
 def test_what_the_firmware_believes_before_it_knows_its_pose_is_no_error(flight: Flight) -> None:
     ticks = np.arange(len(flight.firmware["tick"]))
     restarted = (ticks >= 800) & (ticks < 820)
@@ -196,6 +199,7 @@ def test_what_the_firmware_believes_before_it_knows_its_pose_is_no_error(flight:
     json.dumps(shown, allow_nan=False)
 
 
+@pytest.mark.slow
 def test_plots_of_a_robot_that_never_knew_its_pose_say_so(flight: Flight) -> None:
     blind = dataclasses.replace(flight, firmware=flight.firmware | {"ready": np.zeros(len(flight.time_s), bool)})
     for figure, panels in ((overview(blind, WINDOW, TANK_M, None), 2), (position(blind, WINDOW), 3), (attitude(blind, WINDOW), 3)):
@@ -313,6 +317,7 @@ def test_legend_names_joins_once_however_many_there_are(dock: Flight) -> None:
     pyplot.close(figure)
 
 
+@pytest.mark.slow
 def test_errors_of_a_body_that_comes_apart_do_not_flatten_those_of_the_estimate(dock: Flight, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hil.plots.PARTING_S", 0.2)
     figures = [estimate(each, Window(0.0, 2.0)) for each in (dock, parted_again(dock))]
@@ -322,6 +327,7 @@ def test_errors_of_a_body_that_comes_apart_do_not_flatten_those_of_the_estimate(
         pyplot.close(figure)
 
 
+@pytest.mark.slow
 def test_plots_of_a_dock_say_whose_body_they_show(dock: Flight, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     said: list[str] = []
     monkeypatch.setattr(Figure, "savefig", lambda figure, path, **_: said.append(f"{path.stem}: {figure.get_suptitle()}"))

@@ -17,22 +17,26 @@ def fleet(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", ["run", "doctor"])
 def test_bus_beside_a_fleet_file_is_refused(command: str, fleet: Path, refusal: Callable[..., str]) -> None:
     line = refusal(command, "--fleet", str(fleet), "--bus", "socketcan:can7")
     assert line == f"modcube: --bus beside --fleet: buses, vehicles and rate_hz stand in {fleet}; give one or the other"
 
 
+@pytest.mark.slow
 def test_rate_and_vehicle_beside_a_fleet_file_are_refused_even_at_their_defaults(fleet: Path, refusal: Callable[..., str]) -> None:
     line = refusal("run", "--fleet", str(fleet), "--rate", "100", "--vehicle", "modcube")
     assert line.startswith("modcube: --vehicle, --rate beside --fleet: ")
 
 
+@pytest.mark.slow
 def test_fleet_file_without_buses_is_refused(fleet: Path, refusal: Callable[..., str]) -> None:
     fleet.write_text(FLEET.partition("\n")[2])
     assert f"{fleet}:1: buses: missing key" in refusal("run", "--fleet", str(fleet))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
@@ -46,6 +50,7 @@ def test_options_of_the_ground_side_that_cannot_count_are_refused(arguments: lis
     assert words in refusal("run", "--bus", "virtual:options", *arguments)
 
 
+@pytest.mark.slow
 def test_dock_button_of_a_module_that_the_fleet_lacks_is_refused(fleet: Path, refusal: Callable[..., str]) -> None:
     file = fleet.with_name("ground.toml")
     file.write_text('links = ["udpin:127.0.0.1:0"]\ndock_button = [0, 0, 60, 1]\n')
@@ -60,6 +65,7 @@ def test_one_module_keeps_the_defaults_and_what_the_command_line_says(fleet: Pat
     assert fleet_of(fleet, None, None, None).module[0].number == 7
 
 
+@pytest.mark.slow
 def test_help_tells_the_defaults(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("COLUMNS", "200")
     monkeypatch.setattr("sys.argv", ["modcube", "run", "--help"])

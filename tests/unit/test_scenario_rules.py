@@ -275,6 +275,7 @@ def test_wait_is_about_no_module(load: Load) -> None:
     assert script.is_over(ends_ns + AFTERWARDS_NS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("leaves", "goes", "number"), [(3, 4, 2), (1, 3, 1)], ids=["middle", "leader"])
 def test_steps_after_an_undock_are_for_the_body_that_their_module_is_of_now(leaves: int, goes: int, number: int) -> None:
     third = load_scenario("dock-third")
@@ -345,6 +346,7 @@ def test_path_without_an_attitude_keeps_that_of_the_start(tmp_path: Path) -> Non
         np.testing.assert_allclose(point.q_wb, np.array([1, 0, 0, 1]) / np.sqrt(2.0), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_free_durations_are_as_short_as_the_limits_allow_and_the_rest_of_the_task_is_held(tmp_path: Path) -> None:
     path = flown(waypoints(tmp_path, PATH_TOML, "path.toml")).trajectory
     assert 10.0 < path.duration_s < 44.0
@@ -352,6 +354,7 @@ def test_free_durations_are_as_short_as_the_limits_allow_and_the_rest_of_the_tas
     assert fastest == pytest.approx(0.05, rel=0.01)
 
 
+@pytest.mark.slow
 def test_scenario_flies_the_same_path_where_its_file_is_not(tmp_path: Path) -> None:
     """As on the workers of a cluster. A campaign is resumed only with the same waypoints."""
     here, parameters = waypoints(tmp_path / "here", PATH), Parameters()

@@ -123,6 +123,7 @@ def test_pressure_that_is_repeated_for_two_seconds_is_not_believed_until_it_chan
     assert is_heard(1.1e5 + 1.0)
 
 
+@pytest.mark.slow
 def test_blind_robot_whose_depth_sensor_freezes_comes_up_instead_of_drifting_at_a_depth_it_believes_in() -> None:
     tank, is_frozen = Tank([single()]), False
 
@@ -182,6 +183,7 @@ def test_frozen_imu_is_left_out_of_the_mean() -> None:
     assert none.gyro is None and none.accel is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["gyro", "accel"])
 def test_robot_whose_gyro_or_accelerometer_alone_goes_dead_keeps_upright(name: str) -> None:
     """With a gyro that reads zeros it tumbled at 6 rad/s from the third second on."""
@@ -265,6 +267,7 @@ def test_only_the_reading_that_leaps_is_left_out() -> None:
     assert left.accel is None and left.gyro is not None and left.pressure_pa == 1e5 and left.heard
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "off"), [("gyro", 35.0), ("accel", 50.0), ("pressure_pa", 1e5)])
 def test_one_wrong_reading_does_not_move_the_robot(name: str, off: float) -> None:
     """Without the sensor watch it moves 50 to 200 mm."""

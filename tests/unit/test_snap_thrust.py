@@ -61,6 +61,7 @@ def believed(x: np.ndarray) -> Estimate:
     return Estimate(x[:3].copy(), x[3:7].copy(), x[7:13].copy(), zero, zero, zero, zero, 0, math.nan, 0, 0, True)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("yaw", [None, 0.785])
 @pytest.mark.parametrize("place", [NORTH, EAST, NORTH + EAST - START], ids=["north", "east", "north-east"])
 def test_vehicle_that_leaves_an_axis_to_buoyancy_has_its_missions_planned(passive: Body, place: np.ndarray, yaw: float | None) -> None:
@@ -224,6 +225,7 @@ def by_pseudo_inverse(body: Body, wanted: np.ndarray) -> np.ndarray:
     return np.asarray(np.maximum(forces / body.thrusters.f_max, forces / body.thrusters.f_min).max(axis=1))
 
 
+@pytest.mark.slow
 def test_wrench_that_takes_too_much_is_found_among_any_number_that_only_look_worse(modcube: Body) -> None:
     """They look worse by the pseudo-inverse, which uses thrusters that the best division would spare."""
     wanted = np.random.default_rng(3).normal(size=(400, 6)) * [10.0, 10.0, 10.0, 1.0, 1.0, 1.0]
@@ -238,6 +240,7 @@ def test_wrench_that_takes_too_much_is_found_among_any_number_that_only_look_wor
     assert share == pytest.approx(0.81) and where == 100
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["modcube", "bluerov2", "girona500", "chasing_m2"])
 def test_usage_is_that_of_the_worst_wrench_exactly(name: str) -> None:
     body = assemble_vehicle(load_vehicle(name))

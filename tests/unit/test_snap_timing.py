@@ -49,6 +49,7 @@ def assert_within_limits(path: Piecewise) -> None:
     np.testing.assert_allclose(x[[0, -1], 7:], 0.0, atol=1e-9, err_msg="at rest at both ends")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length_m", [0.05, 1.0, 5.0, 100.0])
 def test_straight_line_takes_hardly_longer_than_full_acceleration_full_speed_and_full_braking(length_m: float) -> None:
     """The least time: of a trapezoid of speed, or of a triangle where the way is too short for full speed. No motion beats it."""
@@ -59,6 +60,7 @@ def test_straight_line_takes_hardly_longer_than_full_acceleration_full_speed_and
     assert least_s < found.path.duration_s < 1.02 * least_s + 4.0
 
 
+@pytest.mark.slow
 def test_diagonal_is_flown_at_the_speed_itself_not_at_its_share_along_each_axis() -> None:
     _, found = timed([np.array([0.0, 0.0, 5.0]), np.array([20.0, 20.0, 25.0])])
     speeds = np.linalg.norm(motion(found.path)[:, 7:10], axis=1)
@@ -66,6 +68,7 @@ def test_diagonal_is_flown_at_the_speed_itself_not_at_its_share_along_each_axis(
     assert np.median(speeds) > 0.97 * SPEED
 
 
+@pytest.mark.slow
 def test_survey_takes_less_than_half_the_time_on_the_same_path() -> None:
     """Regression: a run of places without a stop was slower than one that stopped at each of them."""
     path, found = timed(SURVEY, [0.3 * k for k in range(len(SURVEY))])
@@ -83,6 +86,7 @@ def test_survey_takes_less_than_half_the_time_on_the_same_path() -> None:
         assert is_off < was_off + 0.002
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("speed", "acceleration", "corridor_m"), [(1.0, 0.5, 0.2), (1.0, 2.0, 0.02), (2.0, 2.0, 0.2)])
 def test_path_stays_where_it_was_at_any_acceleration(speed: float, acceleration: float, corridor_m: float) -> None:
     """Regression: at 2 m/s^2 it moved by 58 mm, and left a corridor of 20 mm by 24 mm."""
@@ -97,6 +101,7 @@ def test_path_stays_where_it_was_at_any_acceleration(speed: float, acceleration:
         assert np.linalg.norm(before - place, axis=1).min() < math.hypot(MOVED_M, half_step_m)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("speed", "acceleration"), [(0.3, 2.0), (0.02, 0.1)])
 def test_more_acceleration_than_the_speed_needs_costs_no_time(speed: float, acceleration: float) -> None:
     """Regression: lanes at 0.3 m/s took 174 s with 2 m/s^2, and 92 s with 0.5 m/s^2."""
@@ -114,6 +119,7 @@ def assert_within_corridor(found: Timed, places: list[np.ndarray], corridor_m: f
         np.testing.assert_allclose(ways[-1] + a, b, atol=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 4])
 @pytest.mark.parametrize(("size_m", "longest"), [(0.3, 1.25), (3.0, 1.04), (10.0, 1.04)])
 def test_fastest_path_is_solved_once_and_within_limits(monkeypatch: pytest.MonkeyPatch, size_m: float, longest: float, seed: int) -> None:
@@ -133,6 +139,7 @@ def test_fastest_path_is_solved_once_and_within_limits(monkeypatch: pytest.Monke
     assert found.path.duration_s < longest * by_pace.path.duration_s
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("length_m", "corridor_m"), [(20.0, 0.02), (100.0, 0.1), (200.0, 0.02)])
 def test_corridor_a_thousandth_of_a_leg_and_less_is_flown_within(length_m: float, corridor_m: float) -> None:
     """Regression: where OSQP says, wrongly, that there is no such path, the mission was refused. It stops at each place now."""
@@ -167,6 +174,7 @@ def test_turn_on_the_spot_is_timed_too() -> None:
     assert 2.0 / 0.5 + 0.5 / 0.5 < found.path.duration_s <= path.duration_s
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("slower_than", [1.0, 1.5, 3.0])
 def test_path_is_slowed_no_more_than_the_robot_needs(survey: Piecewise, slower_than: float) -> None:
     """A robot that flies only paths that take a given time or longer."""
@@ -188,6 +196,7 @@ def test_timing_that_nobody_waits_for_any_more_ends() -> None:
         fastest([Waypoint(place) for place in SURVEY], SPEED, LIMITS, wanted=lambda: False)
 
 
+@pytest.mark.slow
 def test_thrusters_of_a_real_robot_bound_the_pace() -> None:
     """At 1.5 m/s a module needs more thrust than a fifth of its thrusters' range."""
     body, fast = assemble_vehicle(load_vehicle("modcube")), 1.5
@@ -198,6 +207,7 @@ def test_thrusters_of_a_real_robot_bound_the_pace() -> None:
     assert np.linalg.norm(motion(found.path)[:, 7:10], axis=1).max() < 0.9 * fast
 
 
+@pytest.mark.slow
 def test_same_path_is_timed_the_same_to_the_byte(survey: Piecewise) -> None:
     first, second = (hastened(survey, SPEED, LIMITS, lambda found: True) for _ in range(2))
     assert first.path.coefficients.tobytes() == second.path.coefficients.tobytes()

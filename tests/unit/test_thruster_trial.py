@@ -31,6 +31,7 @@ def on_trial(thruster: int, since_s: float) -> Water:
     return water
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thruster", range(8))
 def test_thruster_is_used_again_when_the_robot_is_pushed_as_much_without_it(thruster: int) -> None:
     water = Water(seed=thruster)
@@ -42,6 +43,7 @@ def test_thruster_is_used_again_when_the_robot_is_pushed_as_much_without_it(thru
     assert water.detector.now.dead == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thruster", range(8))
 @pytest.mark.parametrize("gain", [0.0, -1.0], ids=["fakes its speed", "reversed"])
 def test_liar_stays_left_out(thruster: int, gain: float) -> None:
@@ -52,6 +54,7 @@ def test_liar_stays_left_out(thruster: int, gain: float) -> None:
     assert water.detector.now.dead == (thruster,)
 
 
+@pytest.mark.slow
 def test_thruster_is_acquitted_twice_and_no_more_until_the_robot_is_armed_again() -> None:
     water = Water(seed=1)
     water.fly()
@@ -88,6 +91,7 @@ def test_verdict_comes_although_a_block_of_the_trial_could_not_be_measured() -> 
     assert [words for _, words in water.run(2.0, WANTED)] == [f"thruster 2 of module 0 {USED_AGAIN}"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thruster", range(8))
 def test_liar_that_nobody_saw_begin_is_not_acquitted(thruster: int) -> None:
     """What it no longer pushes is missed less once its force falls, and still less once it is left out: as if something pushed."""
@@ -101,6 +105,7 @@ def test_liar_that_nobody_saw_begin_is_not_acquitted(thruster: int) -> None:
     assert found == [f"thruster {thruster + 1} of module 0 {LEFT_OUT}"]
 
 
+@pytest.mark.slow
 def test_bodies_that_join_or_part_do_not_count_acquittals_anew() -> None:
     water, again = Water(seed=1), 0
     water.fly()

@@ -125,6 +125,7 @@ runpy.run_path({program!r}, run_name="__main__")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "tool", ["accept", "bench", "build_drag_table", "characterise", "identify", "identify_plants", "margins", "mutants", "tune_gains"]
 )

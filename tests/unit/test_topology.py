@@ -153,6 +153,7 @@ def lattice(cells: list[tuple[int, ...]]) -> Body:
     return assemble(cells, [0] * len(cells), [VEHICLES[0]] * len(cells))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("cells", "leaves", "way"),
     [
@@ -173,6 +174,7 @@ def test_module_leaves_a_lattice_by_a_way_that_no_neighbour_closes(
     np.testing.assert_allclose(np.abs(found.axis_b) if way[2] else found.axis_b, way, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_module_that_its_neighbours_enclose_is_not_undocked() -> None:
     cells = [(x, y, z) for x in range(3) for y in range(3) for z in range(3)]
     with pytest.raises(DescriptionError, match=r"^module 13 cannot leave, enclosed by modules 4, 10, 12, 14, 16, 22: undock one"):

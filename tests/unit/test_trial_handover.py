@@ -88,6 +88,7 @@ def dock(water: Water, pull_s: float = 0.0) -> Water:
     return handed_on(PAIR, other, water)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pull_s", [0.0, 5.0])
 @pytest.mark.parametrize("thruster", range(8))
 def test_thruster_convicted_just_before_a_dock_is_used_again_after_it(thruster: int, pull_s: float) -> None:
@@ -98,6 +99,7 @@ def test_thruster_convicted_just_before_a_dock_is_used_again_after_it(thruster: 
     assert both.detector.now.dead == ()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("gain", "pull_s"), [(0.0, 0.0), (0.0, 5.0), (-1.0, 0.0)])
 @pytest.mark.parametrize("thruster", range(8))
 def test_liar_stays_left_out_after_a_dock(thruster: int, gain: float, pull_s: float) -> None:
@@ -113,6 +115,7 @@ def test_trial_waits_while_magnets_pull_and_no_longer() -> None:
     assert [words for _, words in water.run(2.5, WANTED)] == [used_again(2)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("thruster", range(8))
 def test_thruster_convicted_just_before_its_module_parts_is_used_again_if_that_is_pushed_on(thruster: int) -> None:
     """By 2.5 N: 1.5 N are hardly more than the doubt about a module's own buoyancy, trim and accelerometer."""
@@ -120,6 +123,7 @@ def test_thruster_convicted_just_before_its_module_parts_is_used_again_if_that_i
     assert [words for _, words in part.run(4.0, WANTED)] == [used_again(thruster)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gain", [0.0, -1.0, 1.0], ids=["fakes its speed", "reversed", "the other part is pushed"])
 @pytest.mark.parametrize("thruster", range(8))
 def test_thruster_stays_left_out_after_its_module_parts_if_nothing_pushes_that(thruster: int, gain: float) -> None:

@@ -93,6 +93,7 @@ def test_flight_that_cannot_be_judged_costs_the_most(tools: tuple[Any, Any], tmp
     assert objective.cost(objective.flight[1], metrics) == tools[0].FAILED_COST
 
 
+@pytest.mark.slow
 def test_margins_that_lack_cost_on_top_and_those_that_suffice_cost_nothing(
     tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -168,6 +169,7 @@ def test_other_seed_searches_elsewhere(tools: tuple[Any, Any], tmp_path: Path) -
     assert first.trials[0].params == second.trials[0].params and first.trials[1].params != second.trials[1].params
 
 
+@pytest.mark.slow
 def test_folder_of_another_search_is_not_thrown_away(tools: tuple[Any, Any], tmp_path: Path) -> None:
     search(tools, tmp_path, 2, Inline())
     objective = objective_of(tools, tmp_path)
@@ -177,6 +179,7 @@ def test_folder_of_another_search_is_not_thrown_away(tools: tuple[Any, Any], tmp
     assert json.loads((tmp_path / "search.jsonl").read_text().splitlines()[-1])["number"] == 1
 
 
+@pytest.mark.slow
 def test_folder_is_of_another_search_when_its_scenario_was_edited(tools: tuple[Any, Any], tmp_path: Path) -> None:
     scenario = tmp_path / "mine.toml"
     scenario.write_bytes((ROOT / "hil" / "scenarios" / "hover.toml").read_bytes())
@@ -243,6 +246,7 @@ def test_objective_that_makes_no_sense_is_refused(tools: tuple[Any, Any], tmp_pa
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hover", "shipped", "spiral", "spiral-and-push"])
 def test_objectives_that_are_shipped_can_be_flown(tools: tuple[Any, Any], name: str) -> None:
     objective = tools[0].load_objective(ROOT / "tools" / "objectives" / f"{name}.toml")
@@ -291,6 +295,7 @@ def test_legends_of_the_bode_plot_stand_where_no_line_runs(drawn: list[Any]) -> 
     assert all(legend.get_window_extent().y0 >= panel.get_window_extent().y1 - 0.5 for panel, legend in legends)
 
 
+@pytest.mark.slow
 def test_bode_plot_shows_the_whole_phase_of_a_loop_that_rights_itself(drawn: list[Any]) -> None:
     from loop_response import Response
     from tune_plots import draw_bode
@@ -301,6 +306,7 @@ def test_bode_plot_shows_the_whole_phase_of_a_loop_that_rights_itself(drawn: lis
     assert phase.get_ylim()[0] < phase.dataLim.ymin and phase.dataLim.ymax < phase.get_ylim()[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("most", "top"), [(1.0, 1.1), (1.3, 1.35), (9.0, 1.8)])
 def test_steps_fill_their_plot_and_each_is_seen_where_the_others_agree_with_it(drawn: list[Any], most: float, top: float) -> None:
     from loop_response import STEP_TICKS

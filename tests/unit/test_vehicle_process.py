@@ -30,6 +30,7 @@ from firmware_py.runtime.recorder import Recorder
 from tests.unit.vehicle_runs import bus_of, fly
 
 
+@pytest.mark.slow
 def test_second_signal_does_not_end_the_process_before_its_log_is_closed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fatal: list[int] = []
     close = Recorder.close
@@ -44,6 +45,7 @@ def test_second_signal_does_not_end_the_process_before_its_log_is_closed(tmp_pat
     assert not fatal
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_vehicle_that_is_stopped_while_it_starts_ends_without_a_tick_or_a_log(
     number: signal.Signals, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -61,6 +63,7 @@ def test_vehicle_that_is_stopped_while_it_starts_ends_without_a_tick_or_a_log(
     assert list((tmp_path / "log").iterdir()) == []
 
 
+@pytest.mark.slow
 def test_vehicle_whose_terminal_is_gone_ends_as_it_does_by_a_signal(tmp_path: Path) -> None:
     fatal: list[int] = []
 
@@ -81,6 +84,7 @@ def test_vehicle_that_is_told_to_ignore_the_end_of_its_terminal_does() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "told"), [("girona500", 1), ("modcube", 0)])
 def test_robot_that_carries_no_tag_is_told_so_at_its_start(name: str, told: int, tmp_path: Path) -> None:
     """No camera can see it, so it would wait for its pose forever."""
@@ -104,6 +108,7 @@ def test_vehicle_says_that_a_bus_takes_no_frames(tmp_path: Path, monkeypatch: py
     assert any(re.search(f"bus {bus_of(tmp_path)}: in the last second [0-9]+ full$", line) for line in said)
 
 
+@pytest.mark.slow
 def test_service_manager_hears_that_the_process_ends_before_the_rest_of_it_does(tmp_path: Path) -> None:
     """A process that ends by itself, asked by a ground station, would else be killed by the watchdog while it closes its log."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:

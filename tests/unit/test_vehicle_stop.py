@@ -97,6 +97,7 @@ def test_stop_is_known_however_spoilt_the_log_is_in_which_it_came(tmp_path: Path
     assert last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped
 
 
+@pytest.mark.slow
 def test_person_without_a_ground_station_clears_a_stop_by_hand(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -109,6 +110,7 @@ def test_person_without_a_ground_station_clears_a_stop_by_hand(
         assert not last_flight(tmp_path, FLEET, Codec.load(), 2 * OLD_NS, boot_id()).stopped
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("folder", ["", "missing"])
 def test_folder_in_which_no_vehicle_logged_has_no_stop_to_clear(
     folder: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

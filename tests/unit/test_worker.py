@@ -116,6 +116,7 @@ def step(firmware: Firmware, *requests: DockRequest | PartRequest) -> None:
     firmware.tick(Inputs(1, 0, [ModuleInputs()] * 3))
 
 
+@pytest.mark.slow
 def test_docks_asked_for_in_every_tick_hold_up_no_body_that_came_apart(trio: Firmware) -> None:
     worker = trio.worker
     assert isinstance(worker, Slow)

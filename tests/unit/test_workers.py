@@ -67,6 +67,7 @@ def deadly(*seeds: int) -> Pool:
     return Deadly
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("seeds", "words"),
     [
@@ -122,6 +123,7 @@ def cancelled_on_dask(future: Future[Any]) -> None:
     future.set_running_or_notify_cancel()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", [killed_on_dask, cancelled_on_dask])
 def test_trial_that_a_cluster_loses_is_flown_again(
     end: Callable[[Future[Any]], object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -168,6 +170,7 @@ def test_cluster_that_is_not_there_is_said_in_one_line(address: str, words: str)
         dask_cluster(address)
 
 
+@pytest.mark.slow
 def test_scheduler_that_dies_prints_no_traceback_of_dask() -> None:
     """Regression: one killed while thousands of trials were submitted left 20 lines beside the one that says so."""
     pytest.importorskip("distributed")
