@@ -145,7 +145,7 @@ def fastest(
     """The path of least snap within the corridor, rest to rest, at each place as fast as the speed and the other limits permit there.
 
     Of paths that differ only in pace, all or none are within a corridor: one solution is enough, where `plan` seeks the durations with a
-    dozen. Where no such path is found, it leads straight from stop to stop.
+    dozen. Where no such path is found, or its attitude turns too far, it leads straight from stop to stop.
 
     Args:
         waypoints: two or more, no two neighbours equal (see `distinct`), without given velocities.
@@ -324,13 +324,15 @@ class _Request:
         return found
 
     def path_in_corridor(self) -> Piecewise:
-        """The path of least snap, or, where none is found, straight from stop to stop; in durations of its own, and not checked."""
+        """As of `fastest`, in durations of its own; not checked otherwise."""
         durations = self.durations(None)
         try:
-            return self._path(durations)
+            found = self._path(durations)
+            _check_length(*_resolved(found))
         except InfeasibleError:
-            stops = replace(self.position, fixed=np.ones_like(self.position.fixed))
-            return replace(self, position=stops)._path(durations)
+            position, attitude = (replace(knots, fixed=np.ones_like(knots.fixed)) for knots in (self.position, self.attitude))
+            return replace(self, position=position, attitude=attitude)._path(durations)
+        return found
 
     def _path(self, durations: np.ndarray) -> Piecewise:
         """The trajectory in exactly these durations, not checked. Raises InfeasibleError where it would break a limit of the position."""
@@ -358,17 +360,14 @@ class _Request:
 
     def check(self, found: Piecewise) -> None:
         """Refuses a trajectory that turns too far or too fast, or that the body cannot fly. Raises InfeasibleError."""
-        fine = found.resolved(_CHECK_POINTS, _SHORTEST_QUATERNION)
-        grid = fine.grid(_CHECK_POINTS)
-        self._check_turning(grid, lambda k: _place(found, fine, k))
+        grid, place = _resolved(found)
+        _check_length(grid, place)
+        self._check_turning(grid, place)
         if self.body is not None:
-            self._check_motion(self.body, grid[..., :19].reshape(-1, 19), lambda k: _place(found, fine, k), _CHECK_POINTS + 1)
+            self._check_motion(self.body, grid[..., :19].reshape(-1, 19), place, _CHECK_POINTS + 1)
 
     def _check_turning(self, grid: np.ndarray, place: Callable[[int], Place]) -> None:
-        """Refuses a grid (pieces, points, 20) that turns too far or too fast; `place` as for `_check_motion`."""
-        if (shortest := float(grid[..., 19].min())) < _SHORTEST_QUATERNION:
-            where = place(int(np.argmin(grid[..., 19])))
-            raise InfeasibleError("attitude turns too far", where, f" (length {shortest:.2f}); add a waypoint there")
+        """Refuses a grid (pieces, points, 20) that turns too fast; `place` as for `_check_motion`."""
         rate, change = self.limits.angular_rate, self.limits.angular_acceleration
         for bound, columns, unit in ((rate, slice(10, 13), "rad/s"), (change, slice(16, 19), "rad/s^2")):
             if bound is None:
@@ -440,6 +439,19 @@ def _largest(size: np.ndarray) -> tuple[float, int]:
     if heights[piece, i] > size.max():
         return float(heights[piece, i]), piece * size.shape[1] + i + 1
     return float(size.max()), int(np.argmax(size))
+
+
+def _resolved(found: Piecewise) -> tuple[np.ndarray, Callable[[int], Place]]:
+    """A grid (pieces, points, 20) of the trajectory that resolves its turns, and what gives the place of a flat index into it."""
+    fine = found.resolved(_CHECK_POINTS, _SHORTEST_QUATERNION)
+    return fine.grid(_CHECK_POINTS), lambda flat: _place(found, fine, flat)
+
+
+def _check_length(grid: np.ndarray, place: Callable[[int], Place]) -> None:
+    """Refuses a grid (pieces, points, 20) that turns too far: its quaternion nearly vanishes. `place` as for `_check_motion`."""
+    if (shortest := float(grid[..., 19].min())) < _SHORTEST_QUATERNION:
+        where = place(int(np.argmin(grid[..., 19])))
+        raise InfeasibleError("attitude turns too far", where, f" (length {shortest:.2f}); add a waypoint there")
 
 
 def _place(found: Piecewise, fine: Piecewise, flat: int) -> Place:

@@ -150,6 +150,20 @@ def test_corridor_a_thousandth_of_a_leg_and_less_is_flown_within(length_m: float
     assert found.path.duration_s < 1.2 * (2.0 * length_m + 2.0) / SPEED
 
 
+def test_turns_on_the_spot_before_a_leg_are_flown_from_stop_to_stop_where_the_smooth_path_turns_too_far() -> None:
+    """Regression: one mission of sixteen that looked about twice and then went on for 20 m was refused."""
+    places, yaws = [0.0, 0.0, 0.0, 20.0], [1.8, -2.7, -1.8, 1.9]
+    waypoints = [Waypoint(np.array([x, 0.0, 2.0]), from_euler(0.0, 0.0, yaw)) for x, yaw in zip(places, yaws, strict=True)]
+    with pytest.raises(InfeasibleError, match="attitude turns too far"):
+        plan(waypoints, None, LIMITS)
+    found = fastest(waypoints, SPEED, LIMITS)
+    assert_within_limits(found.path)
+    for waypoint, at_s in zip(waypoints, found.at_s, strict=True):
+        now = found.path.sample(at_s)
+        np.testing.assert_allclose(now.p_wb, waypoint.p_wb, atol=1e-9)
+        assert waypoint.q_wb is not None and abs(now.q_wb @ waypoint.q_wb) == pytest.approx(1.0)
+
+
 @pytest.mark.parametrize("factor", [0.5, 3.0])
 def test_path_is_stretched_to_just_within_its_limits_from_any_pace(survey: Piecewise, factor: float) -> None:
     other = survey.slowed(factor)
