@@ -78,7 +78,6 @@ def plan(
     limits: Limits | None = None,
     body: Body | None = None,
     stretch: bool = True,
-    wanted: Callable[[], bool] = _always,
 ) -> Piecewise:
     """The trajectory of least snap through the waypoints, rest to rest.
 
@@ -90,21 +89,19 @@ def plan(
         limits: of the path.
         body: must be able to fly the path with its thrusters, in still water, with the axes that they do not span left to buoyancy.
         stretch: whether to lengthen the durations until all limits hold; False takes them as they are.
-        wanted: called before each attempt, of which there are a dozen; with many waypoints each takes seconds.
 
     Raises:
         InfeasibleError: states which limit cannot be kept, and where.
         ValueError: too few waypoints, a velocity where the path rests, durations that do not match, or free durations that
             nothing bounds.
-        UnwantedError: the trajectory is no longer `wanted`.
     """
     limits = limits or Limits()
     _check(waypoints)
     if isinstance(durations_s, Sequence | np.ndarray):
-        return _plan(waypoints, durations_s, limits, body, stretch, wanted)
+        return _plan(waypoints, durations_s, limits, body, stretch)
     merged, own = distinct(waypoints)
     try:
-        return _plan(merged, durations_s, limits, body, stretch, wanted)
+        return _plan(merged, durations_s, limits, body, stretch)
     except InfeasibleError as error:
         raise error.renumbered(len(own) - 1 - own[::-1].index(min(error.place.waypoint, own[-1]))) from None
 
@@ -115,10 +112,9 @@ def _plan(
     limits: Limits,
     body: Body | None,
     stretch: bool,
-    wanted: Callable[[], bool],
 ) -> Piecewise:
     """The trajectory through waypoints that are merged where they may be; see `plan`."""
-    request = _Request.of(waypoints if len(waypoints) > 1 else [*waypoints, *waypoints], limits, body, wanted)
+    request = _Request.of(waypoints if len(waypoints) > 1 else [*waypoints, *waypoints], limits, body)
     base = request.durations(durations_s)
     if durations_s is not None and not stretch:
         try:
@@ -152,7 +148,7 @@ def fastest(
         speed_m_s: largest speed, in any direction.
         limits: acceleration, angular_rate and angular_acceleration bound the pace; velocity is not looked at.
         body: must be able to fly the path, as for `plan`.
-        wanted: called before each check of a path.
+        wanted: called before each round of OSQP and each check of a path; with hundreds of waypoints each round takes seconds.
 
     Raises:
         InfeasibleError: states what the body cannot fly, and where.
@@ -318,10 +314,7 @@ class _Request:
 
     def attempt(self, durations: np.ndarray) -> Piecewise:
         """The trajectory in exactly these durations. Raises InfeasibleError and UnwantedError."""
-        self._check_wanted()
-        found = self._path(durations)
-        self.check(found)
-        return found
+        return self.checked(self._path(durations))
 
     def path_in_corridor(self) -> Piecewise:
         """As of `fastest`, in durations of its own; not checked otherwise."""
@@ -335,13 +328,18 @@ class _Request:
         return found
 
     def _path(self, durations: np.ndarray) -> Piecewise:
-        """The trajectory in exactly these durations, not checked. Raises InfeasibleError where it would break a limit of the position."""
+        """The trajectory in exactly these durations, not checked.
+
+        Raises:
+            InfeasibleError: it would break a limit of the position.
+            UnwantedError: the trajectory is no longer `wanted`.
+        """
         system = System.of(durations)
         unknown = solve(system, self.position)
         bounds = planes(self.position.value, self.limits)
         method = "closed form"
         if worst(bounds, system.coefficients(self.position.value, unknown), durations)[0] > 1.0:
-            unknown, method = solve_limited(system, self.position, bounds, unknown), "osqp"
+            unknown, method = solve_limited(system, self.position, bounds, unknown, self._check_wanted), "osqp"
         turning = system.coefficients(self.attitude.value, solve(system, self.attitude))
         both = np.concatenate([system.coefficients(self.position.value, unknown), turning], axis=2)
         breaks = np.concatenate([[0.0], np.cumsum(durations)])
@@ -355,6 +353,7 @@ class _Request:
         return found
 
     def _check_wanted(self) -> None:
+        """Raises UnwantedError where the trajectory is no longer wanted."""
         if not self.wanted():
             raise UnwantedError
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import itertools
 import math
+from collections.abc import Callable
 from contextlib import redirect_stdout
 from dataclasses import dataclass, replace
 from typing import NamedTuple, Self
@@ -232,7 +233,9 @@ def _place_on(piece: int, u: float, durations: np.ndarray) -> Place:
     return Place(piece, float(durations[:piece].sum() + u * durations[piece]))
 
 
-def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.ndarray) -> np.ndarray:
+def solve_limited(
+    system: System, knots: Knots, limits: list[Plane], start: np.ndarray, before_round: Callable[[], None]
+) -> np.ndarray:
     """(n, 4, 3) scaled derivatives of least snap that keep the limits.
 
     Args:
@@ -240,6 +243,7 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
         knots: waypoints (n, 3) and the derivatives given there.
         limits: result of `planes`.
         start: (n, 4, 3) solution without limits.
+        before_round: called before each round of OSQP; what it raises ends them.
 
     Raises:
         InfeasibleError: names the limit and the place of the conflict.
@@ -255,6 +259,7 @@ def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.n
     index = np.repeat(np.arange(len(limits)), _FIRST_POINTS)
     where = np.tile(towards_ends(np.arange(_FIRST_POINTS) / _FIRST_POINTS), len(limits))
     for _ in range(_ROUNDS):
+        before_round()
         try:
             unknown, conflict = problem.solve(table, index, where)
         except (osqp.OSQPException, _GaveUpError) as error:

@@ -13,7 +13,7 @@ from firmware_py.prepare import minimum_snap
 from firmware_py.prepare.assembly import assemble_vehicle
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, fastest, plan
 from firmware_py.prepare.piecewise import Piecewise
-from firmware_py.prepare.snap_limits import solve_limited
+from firmware_py.prepare.snap_limits import _Problem, solve_limited
 from firmware_py.prepare.snap_timing import MOVED_M, Timed, hastened, stretch_within
 
 SPEED, ACCELERATION = 0.3, 0.1
@@ -208,6 +208,20 @@ def test_robot_that_can_fly_nothing_faster_keeps_its_path(survey: Piecewise) -> 
 def test_timing_that_nobody_waits_for_any_more_ends() -> None:
     with pytest.raises(UnwantedError):
         fastest([Waypoint(place) for place in SURVEY], SPEED, LIMITS, wanted=lambda: False)
+
+
+def test_path_that_nobody_waits_for_any_more_is_solved_no_further(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: with five hundred places, 131 s passed before it was seen that the mission had been cancelled."""
+    rounds: list[int] = []
+    solve = _Problem.solve
+    monkeypatch.setattr(_Problem, "solve", lambda *given: rounds.append(1) or solve(*given))
+    places = np.random.default_rng(1).uniform(-10.0, 10.0, (9, 3))
+    fastest([Waypoint(place) for place in places], SPEED, LIMITS)
+    assert len(rounds) > 2
+    rounds.clear()
+    with pytest.raises(UnwantedError):
+        fastest([Waypoint(place) for place in places], SPEED, LIMITS, wanted=lambda: len(rounds) < 2)
+    assert len(rounds) == 2
 
 
 @pytest.mark.slow
