@@ -14,7 +14,8 @@ PYTHON_PACKAGES := python3-venv
 # Peer that `make bench` compares with; nothing else needs it.
 PEERS := mujoco==4.0.0
 # For tools/ and tests/, mypy checks names, attributes and the arguments of calls. Arrays and lambdas there are checked as loosely as the code that they are passed to.
-MYPY_LOOSE := --allow-untyped-defs --allow-incomplete-defs --allow-untyped-calls --allow-any-generics --no-warn-return-any \
+# Their cache is one of their own, as other options spoil it.
+MYPY_LOOSE := --cache-dir .mypy_cache/loose --allow-untyped-defs --allow-incomplete-defs --allow-untyped-calls --allow-any-generics --no-warn-return-any \
 	--no-warn-unused-ignores --implicit-reexport $(addprefix --disable-error-code=,arg-type list-item misc union-attr)
 PIP_INSTALL := -m pip install --quiet --quiet --disable-pip-version-check --no-deps
 
