@@ -22,7 +22,8 @@ from firmware_py.ground.mission_flight import Plan, PlanJob
 from firmware_py.ground.mission_legs import Leg
 from firmware_py.prepare import snap_thrust
 from firmware_py.prepare.assembly import assemble_vehicle
-from firmware_py.prepare.minimum_snap import MOST_LEAN, InfeasibleError, Limits, Waypoint, plan
+from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, plan
+from firmware_py.prepare.snap_check import MOST_LEAN
 from firmware_py.prepare.snap_thrust import divide, least_usage, usage, wrenches
 
 START, NORTH, EAST = np.array([0.0, 0.0, 2.0]), np.array([2.0, 0.0, 2.0]), np.array([0.0, 2.0, 2.0])
