@@ -303,7 +303,7 @@ class _Request:
         return self.checked(self._path(durations))
 
     def path_in_corridor(self) -> Piecewise:
-        """As of `fastest`, in durations of its own; not checked otherwise."""
+        """The path of `fastest`, in durations of its own: neither its pace nor what the body can fly is checked."""
         durations = self.durations(None)
         try:
             found = self._path(durations)
