@@ -111,9 +111,9 @@ def _plan(
                 error.hurried = int(np.argmin(base / request.durations(float(base.sum()))))
             raise
     request.check_standing()
-    if durations_s is None:
-        check_bounded(waypoints, limits, body)
     free = durations_s is None
+    if free:
+        check_bounded(waypoints, limits, body)
     return _fit(lambda factor: replace(request.attempt(base * factor), stretch=factor), free, both_ways=free and request.passes_at_speed())
 
 

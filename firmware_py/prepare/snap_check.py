@@ -10,7 +10,7 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.description.vehicle import AXES
 from firmware_py.prepare.piecewise import Piecewise
-from firmware_py.prepare.snap_limits import InfeasibleError, Limits, Place, crests
+from firmware_py.prepare.snap_limits import InfeasibleError, Limits, Place, largest
 from firmware_py.prepare.snap_thrust import divide, sag, usage
 
 MOST_LEAN = 0.2
@@ -42,22 +42,22 @@ def check_turns(found: Piecewise) -> None:
     _check_length(*_resolved(found))
 
 
+def check_standing(attitudes: np.ndarray, limits: Limits, body: Body) -> None:
+    """Refuses attitudes (n, 4) that the body cannot hold even at rest. Raises InfeasibleError."""
+    still = np.zeros((len(attitudes), 19))
+    still[:, 3:7] = attitudes
+    _check_motion(body, limits, still, Place)
+
+
 def _check_turning(grid: np.ndarray, limits: Limits, place: Callable[[int], Place]) -> None:
     """Refuses a grid (pieces, points, 20) that turns too fast; `place` as for `_check_motion`."""
     rate, change = limits.angular_rate, limits.angular_acceleration
     for bound, columns, unit in ((rate, slice(10, 13), "rad/s"), (change, slice(16, 19), "rad/s^2")):
         if bound is None:
             continue
-        largest, at = _largest(np.linalg.norm(grid[..., columns], axis=-1))
-        if largest > bound:
-            raise InfeasibleError(f"turning takes {largest:.3g} {unit} of at most {bound:g} {unit}", place(at))
-
-
-def check_standing(attitudes: np.ndarray, limits: Limits, body: Body) -> None:
-    """Refuses attitudes (n, 4) that the body cannot hold even at rest. Raises InfeasibleError."""
-    still = np.zeros((len(attitudes), 19))
-    still[:, 3:7] = attitudes
-    _check_motion(body, limits, still, Place)
+        most, at = largest(np.linalg.norm(grid[..., columns], axis=-1))
+        if most > bound:
+            raise InfeasibleError(f"turning takes {most:.3g} {unit} of at most {bound:g} {unit}", place(at))
 
 
 def _check_motion(body: Body, limits: Limits, motion: np.ndarray, place: Callable[[int], Place], run: int = 1) -> None:
@@ -73,7 +73,7 @@ def _check_motion(body: Body, limits: Limits, motion: np.ndarray, place: Callabl
         raise UnreachableError(f"neither thrusters nor buoyancy give {what}, which it takes", place(k))
     if (falling := np.flatnonzero(np.isinf(part.lean))).size:
         raise InfeasibleError("neither thrusters nor buoyancy keep the robot from falling over", place(int(falling[0])))
-    lean, k = _largest(part.lean.reshape(-1, run))
+    lean, k = largest(part.lean.reshape(-1, run))
     if lean > MOST_LEAN:
         degrees, name = f"{math.degrees(lean):.1f} deg, of at most {math.degrees(MOST_LEAN):.1f} deg", AXES[part.axis[k]]
         rest = f"; keep it level in {name} there" if place(k).time_s is None else ""
@@ -86,17 +86,6 @@ def _check_motion(body: Body, limits: Limits, motion: np.ndarray, place: Callabl
 def _thrust_message(share: float, limit: float) -> str:
     used, allowed = f"{100.0 * share:.0f} %" if share < HOPELESS else f"more than {100.0 * HOPELESS:.0f} %", f"{100.0 * limit:.0f} %"
     return f"the thrusters would be used to {used} of their range, of at most {allowed},"
-
-
-def _largest(size: np.ndarray) -> tuple[float, int]:
-    """The maximum of smooth quantities (pieces, points), including crests between points, and the flat index of the nearest point."""
-    if size.shape[1] < 3:
-        return float(size.max()), int(np.argmax(size))
-    heights, _ = crests(size)
-    piece, i = divmod(int(np.argmax(heights)), heights.shape[1])
-    if heights[piece, i] > size.max():
-        return float(heights[piece, i]), piece * size.shape[1] + i + 1
-    return float(size.max()), int(np.argmax(size))
 
 
 def _resolved(found: Piecewise) -> tuple[np.ndarray, Callable[[int], Place]]:

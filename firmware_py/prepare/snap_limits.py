@@ -219,6 +219,17 @@ def crests(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return at + 0.5 * slope * offset, np.arange(1, values.shape[-1] - 1) + offset
 
 
+def largest(size: np.ndarray) -> tuple[float, int]:
+    """The maximum of smooth quantities (pieces, points), including crests between points, and the flat index of the nearest point."""
+    if size.shape[1] < 3:
+        return float(size.max()), int(np.argmax(size))
+    heights, _ = crests(size)
+    piece, i = divmod(int(np.argmax(heights)), heights.shape[1])
+    if heights[piece, i] > size.max():
+        return float(heights[piece, i]), piece * size.shape[1] + i + 1
+    return float(size.max()), int(np.argmax(size))
+
+
 def worst(limits: list[Plane], coefficients: np.ndarray, durations: np.ndarray) -> tuple[float, str, Place]:
     """Largest ratio of any limited quantity to its limit, the name of that limit, and its place; 0 without limits."""
     if not limits:
@@ -233,9 +244,7 @@ def _place_on(piece: int, u: float, durations: np.ndarray) -> Place:
     return Place(piece, float(durations[:piece].sum() + u * durations[piece]))
 
 
-def solve_limited(
-    system: System, knots: Knots, limits: list[Plane], start: np.ndarray, before_round: Callable[[], None]
-) -> np.ndarray:
+def solve_limited(system: System, knots: Knots, limits: list[Plane], start: np.ndarray, before_round: Callable[[], None]) -> np.ndarray:
     """(n, 4, 3) scaled derivatives of least snap that keep the limits.
 
     Args:

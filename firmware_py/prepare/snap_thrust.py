@@ -15,7 +15,7 @@ from firmware_py.core import rotations
 from firmware_py.core.body import RANK_TOLERANCE, Body, rank_by
 from firmware_py.core.drag_lookup import NODES, add_drag
 from firmware_py.core.rigid_body import add_restoring, take_coriolis
-from firmware_py.core.rotations import M, V, rotate_back
+from firmware_py.core.rotations import M, V, cross, rotate_back
 
 _SATURATION_TOLERANCE = 1e-6
 """Tolerance, as a share of a thruster's limit, within which the thruster counts as saturated."""
@@ -63,15 +63,12 @@ def wrenches(body: Body, motion: np.ndarray) -> np.ndarray:
 
 @njit(f"void({M},{V},{NODES},{V},{V},{M},{M})", cache=True, error_model="numpy")
 def _take_wrenches(mass, righting, nodes, rotational, linear, motion, out):  # type: ignore[no-untyped-def]
-    """Writes the (k, 6) wrenches of `wrenches`."""
+    """Writes the wrenches (k, 6) of motion (k, 19) to `out`, see `wrenches`; mass (6, 6), righting (3,), and fields of the DragTable."""
     nu, change, passive = np.empty(6), np.empty(6), np.empty(6)
     for k in range(len(motion)):
         q_wb, w_b = motion[k, 3:7], motion[k, 10:13]
         nu[:3], nu[3:] = rotate_back(q_wb, motion[k, 7:10]), w_b
-        change[:3], change[3:] = rotate_back(q_wb, motion[k, 13:16]), motion[k, 16:19]
-        change[0] -= w_b[1] * nu[2] - w_b[2] * nu[1]
-        change[1] -= w_b[2] * nu[0] - w_b[0] * nu[2]
-        change[2] -= w_b[0] * nu[1] - w_b[1] * nu[0]
+        change[:3], change[3:] = rotate_back(q_wb, motion[k, 13:16]) - cross(w_b, nu[:3]), motion[k, 16:19]
         passive[:] = 0.0
         take_coriolis(mass, nu, passive)
         add_drag(nodes, rotational, linear, nu, passive)

@@ -16,7 +16,7 @@ import scipy.sparse as sparse
 from scipy.optimize import linprog
 
 from firmware_py.prepare.piecewise import Piecewise
-from firmware_py.prepare.snap_limits import Limits, crests, towards_ends
+from firmware_py.prepare.snap_limits import Limits, largest, towards_ends
 from firmware_py.prepare.snap_spline import Knots, System, solve
 
 _POINTS = 128
@@ -124,8 +124,8 @@ class _Bounds(NamedTuple):
     def stretch(self, path: Piecewise) -> float:
         """The factor by which all durations of a path may be multiplied for it to just keep the bounds."""
         grid = path.grid(_CHECK_POINTS)
-        speed, rate, twist = (_largest(np.linalg.norm(grid[..., k : k + 3], axis=-1)) for k in (7, 10, 16))
-        push = _largest(np.max(np.abs(grid[..., 13:16]) / self.acceleration[:3], axis=-1))
+        speed, rate, twist = (largest(np.linalg.norm(grid[..., k : k + 3], axis=-1))[0] for k in (7, 10, 16))
+        push, _ = largest(np.max(np.abs(grid[..., 13:16]) / self.acceleration[:3], axis=-1))
         return max(speed / self.speed, rate / self.rate, math.sqrt(push), math.sqrt(twist / float(self.acceleration[3])))
 
 
@@ -144,7 +144,7 @@ def hastened(path: Piecewise, speed_m_s: float, limits: Limits, is_flyable: Call
         is_flyable: whether the robot can fly a path.
     """
     best, bounds, motion = Timed(path, path.breaks), _Bounds.of(speed_m_s, limits), _Motion.along(path)
-    as_before = min(speed_m_s, _largest(np.linalg.norm(path.grid(_CHECK_POINTS)[..., 7:10], axis=-1))) or speed_m_s
+    as_before = min(speed_m_s, largest(np.linalg.norm(path.grid(_CHECK_POINTS)[..., 7:10], axis=-1))[0]) or speed_m_s
     for speed in sorted({as_before, speed_m_s}):  # thrusters may permit no more than before
         for share in _SHARES:
             eased = bounds._replace(speed=speed).eased(share)
@@ -171,11 +171,6 @@ def _least_slowed(timed: Timed, longest: float, is_flyable: Callable[[Piecewise]
         else:
             low = middle
     return found
-
-
-def _largest(values: np.ndarray) -> float:
-    """The maximum of a smooth quantity (pieces, points), with the crests between points."""
-    return float(max(values.max(), crests(values)[0].max()))
 
 
 def _fastest(motion: _Motion, bounds: _Bounds) -> _Pace:
