@@ -34,6 +34,8 @@ ANY = frozenset(Mode)
 PLACED = frozenset(row.mode for row in MODE_TABLE if Need.POSITION in row.needs)
 """Modes that hold or follow a position."""
 MOVING = PLACED - {Mode.POSHOLD}
+UPRIGHT = frozenset(row.mode for row in MODE_TABLE if Need.ATTITUDE in row.needs) | {Mode.SURFACE}
+"""Modes that hold or follow an attitude; SURFACE does so once one is known."""
 FREE = PLACED - {Mode.DOCK}
 """Position modes in which nothing but the water should push the body."""
 TRUSTING = frozenset({Mode.ALT_HOLD, Mode.STABILIZE})
@@ -82,6 +84,7 @@ TABLE = (
     Row("cabin_hot", "cabin hot", "cabin_c", ": {:.0f} degC"),
     Row("cabin_pressure", "cabin pressure off", "cabin_change_pa", " by {:.0f} Pa"),
     Row("axis_lost", "the thrusters left cannot make every wrench", "lost_axes"),
+    Row("attitude_lost", "attitude not held", "attitude_off_deg", ": {:.0f} deg off", modes=UPRIGHT),
     Row("depth_unknown", "depth unknown", "depth_unknown_s", LASTS, modes=PLACED | {Mode.ALT_HOLD}),
     Row("tag_gone", "no tag", "tag_age_s", LASTS, modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
     Row("partner_lost", "a docked partner is lost", "partner_lost"),

@@ -351,11 +351,12 @@ class Guidance:
         return self._was_unplaced or bool(np.linalg.norm(setpoint.p_wb[:2] - estimate.p_wb[:2]) > NEAR_M)
 
     def _follow_body(self, setpoint: Setpoint, estimate: Estimate) -> Setpoint:
-        """Moves the set-point along with the body where position is not held: horizontally, or in all axes."""
+        """Moves the set-point along with the body where its pose is not held: horizontally, in position, or in attitude too."""
+        force, moment = CONTROLLED[self.mode]
         p_wb = estimate.p_wb.copy()
-        if CONTROLLED[self.mode].force != Keep.NOTHING:
+        if force != Keep.NOTHING:
             p_wb[2] = setpoint.p_wb[2]
-        moved = setpoint._replace(p_wb=p_wb)
+        moved = setpoint._replace(p_wb=p_wb, q_wb=estimate.q_wb if moment == Keep.NOTHING else setpoint.q_wb)
         self._glider.put(moved)
         return moved
 

@@ -103,6 +103,9 @@ class Health(NamedTuple):
     """
     estop_box_age_s: float = math.nan
     """NaN before an e-stop box was heard."""
+    attitude_off_deg: float = 0.0
+    """Angle between the body and its set-point, about axes that its thrusters can turn, deg; RMS over a second, because a body that swings
+    passes its set-point again and again."""
 
     @property
     def unseen_push_m_s(self) -> float:

@@ -6,11 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
+import numpy as np
+
 from firmware_py.core.body import Body, axes_without_thrust
 from firmware_py.core.faults import ESC_DOWN, ThrusterFaults, by_channel
 from firmware_py.core.fence import outside
 from firmware_py.core.health import Health
-from firmware_py.core.rotations import rotate
+from firmware_py.core.rotations import difference, rotate
 from firmware_py.core.thruster_names import Place, places_of
 from firmware_py.core.types import (
     MCU_ESTOP,
@@ -23,6 +25,7 @@ from firmware_py.core.types import (
     Inputs,
     ModuleInputs,
     Request,
+    Setpoint,
 )  # fmt: skip
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import AXES
@@ -63,6 +66,7 @@ class _Latest:
     error_rate: float = 0.0
     missed_rate: float = 0.0
     push_m2_s2: float = 0.0
+    off_rad2: float = 0.0
 
 
 class PerModule:
@@ -208,7 +212,14 @@ class HealthMonitor:
             late=tuple([m for m in silent if now - self._reports.late_ns[m] <= self._answer_ns]),
             still_s=min(at - self._reports.hears_ns[m] for m, at in self._reports.heard_ns.items()) * 1e-9,
             estop_box_age_s=_age_s(latest.estop_box_ns, now),
+            attitude_off_deg=math.degrees(math.sqrt(latest.off_rad2)),
         )
+
+    def compare(self, setpoint: Setpoint, estimate: Estimate, keep: np.ndarray) -> None:
+        """Notes how far the body is turned from its set-point, while that is known. `keep`: (6, 6) ThrusterFaults.keep."""
+        if estimate.ready:
+            off_rad = keep[3:, 3:] @ difference(setpoint.q_wb, estimate.q_wb)
+            self._latest.off_rad2 += 1e-9 * self._period_ns / MEAN_S * (off_rad.dot(off_rad) - self._latest.off_rad2)
 
     def _listen(self, modules: Sequence[ModuleInputs], now: int) -> None:
         for index in self._reports.heard_ns:

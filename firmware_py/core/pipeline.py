@@ -160,6 +160,7 @@ class BodyPipeline:
         """Guide, control, allocate, limit. Returns the record of every signal, and the (n,) thruster commands."""
         health = self.health.now
         setpoint, ahead = self.guidance.step(time_ns, estimate, health)
+        self.health.compare(setpoint, estimate, self.faults.now.keep)
         wrench = self.controller.step(setpoint, ahead, estimate)
         wrench = self.guidance.mix(wrench, time_ns, estimate, health)
         self.allocator.confine(self.limiter.limits(self.supply.voltage_v))

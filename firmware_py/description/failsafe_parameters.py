@@ -79,6 +79,15 @@ class Failsafes:
     axis_lost_delay_s: float = delay(3.0, "FS_AXIS_S")
     axis_lost_action: int = action(4, "FS_AXIS_ACT")
     axis_lost_latched: int = latched(1, "FS_AXIS_LAT")
+    # the body does not turn as it is told: something holds or tows it, thrusters or gains do not fit it, or frames come too late. With 5 it
+    # is disarmed, as by ArduSub's crash check, which also waits for 30 deg and two seconds
+    attitude_lost_limit: float = quantity(
+        30.0, unit="deg", low=5, high=180, help="largest permitted angle between body and set-point, RMS over one second",
+        mavlink="FS_ATT_LIM",
+    )
+    attitude_lost_delay_s: float = delay(2.0, "FS_ATT_S")
+    attitude_lost_action: int = action(1, "FS_ATT_ACT")
+    attitude_lost_latched: int = latched(0, "FS_ATT_LAT")
     # depth unknown
     depth_unknown_limit: float = quantity(
         5.0, unit="s", low=0.1, high=600,

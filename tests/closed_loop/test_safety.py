@@ -4,6 +4,7 @@ Thrusters that die or lie on the spiral, lost frames, e-stops at any tick, missi
 """
 
 import dataclasses
+import math
 from collections.abc import Callable
 from contextlib import ExitStack
 from types import SimpleNamespace
@@ -11,6 +12,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from firmware_py.core.failsafes import Level
+from firmware_py.core.rotations import difference
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Inputs, Mode, Outputs, Request
 from firmware_py.description.parameters import Parameters
@@ -153,14 +156,37 @@ def test_robot_without_tags_surfaces_though_it_believes_to_be_there_and_rests_th
     assert 0.5 < np.mean(current_a[-300:]) < 3.5
 
 
-def fly(scenario: str, seconds: float, fault: Fault, prepare: Callable[[Bench], None], watch: Callable[[Bench, Outputs], None]) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize("action", [Level.WARN, Level.DISARM])
+def test_robot_that_swings_as_all_frames_are_late_is_told_of_or_disarmed(action: Level) -> None:
+    failsafes = dataclasses.replace(Parameters().failsafes, attitude_lost_action=int(action))
+    off_deg: list[float] = []
+    told: list[tuple[int, str]] = []
+
+    def watch(bench: Bench, outputs: Outputs) -> None:
+        (record,) = outputs.records
+        off_deg.append(math.degrees(np.linalg.norm(difference(record.setpoint.q_wb, bench.nodes.world.body_truth(0).q_wb))))
+        told.extend((outputs.tick, event.text) for event in outputs.events if "attitude not held" in event.text)
+        assert record.state == (State.ARMED if outputs.tick >= 300 and (action == Level.WARN or not told) else State.DISARMED)
+
+    late = Fault(kind="frame_delay", value=130.0, at_s=5.0)
+    fly("faults", 25.0, late, lambda bench: None, watch, dataclasses.replace(Parameters(), failsafes=failsafes))
+    at, text = told[0]
+    assert text.startswith("fail-safe on") and np.sqrt(np.mean(np.square(off_deg[at - 300 : at]))) > 25.0 and max(off_deg[300:500]) < 3.0
+
+
+def fly(
+    scenario: str, seconds: float, fault: Fault, prepare: Callable[[Bench], None], watch: Callable[[Bench, Outputs], None],
+    parameters: Parameters | None = None,
+) -> None:  # fmt: skip
     """Flies the bodies of a scenario, which arm at 3 s and hold; `watch` is called once a tick."""
 
     def requests(time_ns: int, last: Outputs | None) -> list[Request]:
         return [Request(Action.ARM, record.body) for record in last.records] if last and time_ns == 3_000_000_000 else []
 
     with ExitStack() as stack:
-        bench = open_bench(stack, dataclasses.replace(load_scenario(scenario), fault=(fault,)), 1, Parameters(), "virtual:one-fault")
+        world = dataclasses.replace(load_scenario(scenario), fault=(fault,))
+        bench = open_bench(stack, world, 1, parameters or Parameters(), "virtual:one-fault")
         prepare(bench)
         script = SimpleNamespace(ticks=round(100 * seconds), is_over=lambda time_ns: False, requests=requests)
         bench.script = script

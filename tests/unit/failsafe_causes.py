@@ -15,7 +15,8 @@ ROWS = {row.name: row for row in TABLE}
 FIELDS: dict[str, str] = {
     "leak": "leak", "bus_silent": "bus_silent_s", "foreign_sync": "foreign_sync",
     "foreign_command": "foreign_command", "battery_critical": "voltage_share",
-    "cabin_hot": "cabin_c", "cabin_pressure": "cabin_change_pa", "axis_lost": "lost_axes", "depth_unknown": "",
+    "cabin_hot": "cabin_c", "cabin_pressure": "cabin_change_pa", "axis_lost": "lost_axes",
+    "attitude_lost": "attitude_off_deg", "depth_unknown": "",
     "tag_gone": "tag_age_s", "partner_lost": "open_joints", "estimator": "nis_ratio", "rejected": "rejected_share",
     "tag_lost": "tag_age_s", "pushed": "push_m_s", "tag_late": "tag_age_s",
     "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "sensor_lost": "sensor_age_s", "module_silent": "silent_s", "module_late": "late",
@@ -37,6 +38,7 @@ WORDS = {
     "cabin_hot": "cabin hot: 70 degC",
     "cabin_pressure": "cabin pressure off by 20000 Pa",
     "axis_lost": "the thrusters left cannot make every wrench",
+    "attitude_lost": "attitude not held: 30 deg off",
     "depth_unknown": "depth unknown for 5.0 s",
     "tag_gone": "no tag for 8.0 s",
     "partner_lost": "a docked partner is lost",

@@ -91,6 +91,7 @@ COUNTS = {
     "estimator": POSE_MODES | {Mode.ALT_HOLD, Mode.STABILIZE},
     "rejected": POSE_MODES | {Mode.ALT_HOLD, Mode.STABILIZE},
     "tag_lost": POSE_MODES,
+    "attitude_lost": set(Mode) - {Mode.MANUAL, Mode.MOTOR_DETECT},
     "pushed": POSE_MODES - {Mode.DOCK},
     "tag_late": POSE_MODES - {Mode.POSHOLD},
     "fence": POSE_MODES - {Mode.POSHOLD},

@@ -21,6 +21,9 @@ def test_manual_sticks_are_forces_and_moments_of_the_body() -> None:
     assert wrench[0] > 5.0 and wrench[5] < -0.3 and not np.any(wrench[1:5])
     flight.run(1.0)
     assert not flight.wrenches[-1].any(), "sticks that fell silent are neutral"
+    flight.estimate = estimate(q=from_euler(0.9, -0.3, 2.0))
+    flight.run(0.1, follows=False)
+    np.testing.assert_array_equal(flight.setpoints[-1].q_wb, flight.estimate.q_wb, "the pilot holds the attitude, nobody else")
 
 
 @pytest.mark.parametrize("axis", range(6))

@@ -14,6 +14,7 @@ from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.health_monitor import HealthMonitor, PerModule
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import exp
+from firmware_py.core.setpoint import rest_at
 from firmware_py.core.thruster_names import Place
 from firmware_py.core.types import (
     MCU_TIMED_OUT,
@@ -42,6 +43,10 @@ BODY = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [MODCUBE] * 2, [1, 3])
 EVERY = tuple(Place(module, channel) for module in (1, 3) for channel in range(8))
 SINGLE = assemble([(0, 0, 0)], [0], [MODCUBE], [1])
 ZERO = np.zeros(3)
+ESTIMATE = Estimate(
+    np.array([1.0, -2.0, 3.0]), np.array([1.0, 0, 0, 0]), np.zeros(6), ZERO, ZERO, np.array([0.01, 0.03, 0.02]),
+    np.full(3, 0.002), 30_000_000, 6.0, 6, 0, True,
+)  # fmt: skip
 
 
 class MonitorBench:
@@ -60,11 +65,7 @@ class MonitorBench:
         self.time_ns += TICK_NS
         other = more.get("others", ModuleInputs())
         modules = [other, one or ModuleInputs(), other, three or ModuleInputs()]
-        estimate = Estimate(
-            np.array([1.0, -2.0, 3.0]), np.array([1.0, 0, 0, 0]), np.zeros(6), ZERO, ZERO, np.array([0.01, 0.03, 0.02]),
-            np.full(3, 0.002), 30_000_000, 6.0, 6, 0, True,
-        )  # fmt: skip
-        estimate = estimate._replace(**{k: v for k, v in more.items() if k in Estimate._fields})  # type: ignore[arg-type]
+        estimate = ESTIMATE._replace(**{k: v for k, v in more.items() if k in Estimate._fields})  # type: ignore[arg-type]
         self.monitor.believed = modules
         inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped, **self.foreign)
         faults = ThrusterFaults(np.ones(self.count, dtype=bool), (), 0, np.eye(6), np.ones(2))
@@ -332,6 +333,20 @@ def test_ground_station_and_pilot_count_once_they_were_heard() -> None:
     bench.step(None, None, Request(Action.GROUND_ALIVE), Request(Action.STICKS, 1, Sticks((0.0, -0.4, 0.1), (0.0, 0.2, 0.0))))
     health = bench.wait(0.5)
     assert health.ground_age_s == health.pilot_age_s == pytest.approx(0.5) and health.stick == 0.4
+
+
+@pytest.mark.parametrize(("keep", "wanted_rad"), [(np.eye(6), 1.3), (np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 0.0]), 0.5)])
+def test_body_that_swings_is_off_its_set_point_by_the_rms_about_axes_that_it_can_turn(keep: np.ndarray, wanted_rad: float) -> None:
+    bench, turned_rad = MonitorBench(), np.sqrt(2.0) * np.array([0.3, -0.4, 1.2])
+    off_deg = []
+    for tick in range(1000):
+        q_wb = np.asarray(exp(turned_rad * np.sin(2.0 * np.pi * tick / 50)))
+        bench.monitor.compare(rest_at(ZERO, exp(ZERO)), ESTIMATE._replace(q_wb=q_wb), keep)
+        off_deg.append(bench.step().attitude_off_deg)
+    assert off_deg[99] == pytest.approx(math.degrees(wanted_rad) * math.sqrt(1.0 - math.exp(-1.0)), rel=0.02)
+    assert off_deg[-1] == pytest.approx(math.degrees(wanted_rad), rel=0.1)
+    bench.monitor.compare(rest_at(ZERO, exp(ZERO)), ESTIMATE._replace(ready=False), keep)
+    assert bench.step().attitude_off_deg == off_deg[-1], "without an attitude nobody knows better"
 
 
 def test_e_stop_box_counts_once_it_was_heard_by_any_part_of_the_body() -> None:
