@@ -29,8 +29,10 @@ COUNTING = """\
 Most severe first, with the default parameters (`failsafes.NAME_limit`, `_delay_s`, `_action`, `_latched`). "always" is in every mode, and
 while disarmed; the others count only while armed. In a mode marked "by a fail-safe" one counts only if a fail-safe and not a person chose
 that mode, and where it "only warns" its action does not apply. While a fail-safe with another action than warn is on, the body is not armed
-(forced arming skips this)."""
+(forced arming skips this). In a body of several modules the text names those behind it: "water in a cabin (module 1)"."""
 WATCHED = """\
+- `attitude_lost`: the angle to the set-point, RMS over a second, about the axes that the thrusters left can turn. Something holds the body,
+  its thrusters or gains do not fit it, or frames come so late that it swings.
 - `module_silent`: no frame of a module comes, or it reports that it obeys no commands (BOOT, TIMEOUT or FAULT in MCU_STATUS).
   While every module of a body reports so, its path waits and its set-point rests where the body is: it does not swim back by itself
   afterwards.

@@ -9,6 +9,7 @@ from typing import NamedTuple
 from firmware_py.core.alignment import AGREE_S
 from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
+from firmware_py.core.module_reports import name_modules
 from firmware_py.core.thruster_names import listed
 from firmware_py.core.transitions import MODES, Need
 from firmware_py.core.types import Mode
@@ -43,7 +44,7 @@ def _estop(q: Question) -> str:
     """
     if q.estop_age_ms < q.parameters.supervision.estop_quiet_ms:
         return "e-stop raised"
-    return f"an e-stop holds module {', '.join(map(str, q.health.stopped))}" if q.health.stopped else ""
+    return f"an e-stop holds {name_modules(q.health.stopped)}" if q.health.stopped else ""
 
 
 def _estop_box(q: Question) -> str:
@@ -54,11 +55,11 @@ def _estop_box(q: Question) -> str:
 def _answers(q: Question) -> list[str]:
     late, mute = q.health.late, [m for m in q.health.silent if m not in q.health.late]
     kinds = (mute, "does not answer"), (late, "answers too late, or for another tick")
-    return [f"module {', '.join(map(str, which))} {what}" for which, what in kinds if which]
+    return [f"{name_modules(which)} {what}" for which, what in kinds if which]
 
 
 def _fit(q: Question) -> str:
-    return f"module {', '.join(str(m) for m in q.health.unfit)} starts, hears no commands, or has a fault" if q.health.unfit else ""
+    return f"{name_modules(q.health.unfit)} starts, hears no commands, or has a fault" if q.health.unfit else ""
 
 
 def _needs(q: Question) -> list[str]:

@@ -5,12 +5,13 @@ The first row is the gravest. `Failsafes` keeps the timers of each row; the supe
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+from collections.abc import Callable, Container, Sequence
 from enum import IntEnum
 from operator import attrgetter
 from typing import NamedTuple
 
 from firmware_py.core.health import NEVER_S, Health
+from firmware_py.core.module_reports import name_modules
 from firmware_py.core.transitions import MODE_TABLE, Need
 from firmware_py.core.types import Mode
 from firmware_py.description.failsafe_parameters import Failsafes as FailsafeParameters
@@ -72,22 +73,34 @@ class Row(NamedTuple):
     """Further modes, in which it counts only if a fail-safe and not a person chose them."""
     warned_modes: frozenset[Mode] = frozenset()
     """Further modes, in which it only warns, whatever its action."""
+    who: Callable[[Health], str] = lambda health: ""
+    """Names the modules that cause it, in a body of several; follows in brackets."""
+
+
+def least(*tables: str) -> Callable[[Health], str]:
+    """For `Row.who`: the modules with the least value of all in these tables of ModuleReports: the lowest voltage, or the oldest time."""
+    return lambda health: health.reports.named(min, *tables)
+
+
+def most(*tables: str) -> Callable[[Health], str]:
+    """The same for the largest value."""
+    return lambda health: health.reports.named(max, *tables)
 
 
 LASTS = " for {:.1f} s"
 TABLE = (
-    Row("leak", "water in a cabin", "leak"),
+    Row("leak", "water in a cabin", "leak", who=most("leak")),
     Row("bus_silent", "bus silent", "bus_silent_s", LASTS),
     Row("foreign_sync", "somebody else sends SYNC", "foreign_sync"),
     Row("foreign_command", "somebody else commands modules", "foreign_command"),
-    Row("battery_critical", "battery critical", "voltage_share", ": {:.0%} of its voltage", below=True),
-    Row("cabin_hot", "cabin hot", "cabin_c", ": {:.0f} degC"),
-    Row("cabin_pressure", "cabin pressure off", "cabin_change_pa", " by {:.0f} Pa"),
+    Row("battery_critical", "battery critical", "voltage_share", ": {:.0%} of its voltage", below=True, who=least("voltage_share")),
+    Row("cabin_hot", "cabin hot", "cabin_c", ": {:.0f} degC", who=most("cabin_c")),
+    Row("cabin_pressure", "cabin pressure off", "cabin_change_pa", " by {:.0f} Pa", who=most("cabin_change_pa")),
     Row("axis_lost", "the thrusters left cannot make every wrench", "lost_axes"),
     Row("attitude_lost", "attitude not held", "attitude_off_deg", ": {:.0f} deg off", modes=UPRIGHT),
     Row("depth_unknown", "depth unknown", "depth_unknown_s", LASTS, modes=PLACED | {Mode.ALT_HOLD}),
     Row("tag_gone", "no tag", "tag_age_s", LASTS, modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
-    Row("partner_lost", "a docked partner is lost", "partner_lost"),
+    Row("partner_lost", "a docked partner is lost", "partner_lost", who=attrgetter("open_joint_words")),
     Row("estimator", "sensors and model disagree", "nis_ratio", ": {:.1f} of the expected", modes=PLACED, warned_modes=TRUSTING),
     Row("rejected", "tags refused", "rejected_share", ": {:.0%} of them", modes=PLACED, warned_modes=TRUSTING),
     Row("tag_lost", "no tag", "tag_age_s", LASTS, modes=PLACED),
@@ -95,9 +108,9 @@ TABLE = (
     Row("tag_late", "no tag", "tag_age_s", LASTS, modes=MOVING),
     Row("depth_lost", "no pressure", "depth_age_s", LASTS),
     Row("imu_lost", "no IMU", "imu_age_s", LASTS),
-    Row("sensor_lost", "a module of several has no IMU or no pressure", "sensor_age_s", LASTS),
-    Row("module_silent", "a module is silent", "silent_s", LASTS),
-    Row("module_late", "a module answers too late, or for another tick", "any_late"),
+    Row("sensor_lost", "a module of several has no IMU or no pressure", "sensor_age_s", LASTS, who=least("imu_ns", "pressure_ns")),
+    Row("module_silent", "a module is silent", "silent_s", LASTS, who=least("hears_ns")),
+    Row("module_late", "a module answers too late, or for another tick", "any_late", who=lambda health: name_modules(health.late)),
     Row("estop_box_silent", "e-stop box silent", "estop_box_age_s", LASTS),
     Row("ticks_missed", "ticks missed", "missed_ticks_per_s", ": {:.0f} in a second"),
     Row("fence", "outside the fence", "outside_m", " by {:.2f} m", modes=MOVING, forced_modes=frozenset({Mode.ALT_HOLD})),
@@ -105,9 +118,9 @@ TABLE = (
     Row("ground_lost", "ground station silent", "ground_age_s", LASTS, modes=ANY - {Mode.AUTO, Mode.SURFACE}),
     Row("pilot_lost", "pilot silent", "pilot_age_s", LASTS, modes=PILOTED),
     Row("thruster_lost", "a thruster is out", "thruster_lost"),
-    Row("cabin_unknown", "no reading of a cabin", "cabin_age_s", LASTS),
-    Row("battery_unknown", "no reading of a battery", "battery_age_s", LASTS),
-    Row("battery_low", "battery low", "voltage_share", ": {:.0%} of its voltage", below=True),
+    Row("cabin_unknown", "no reading of a cabin", "cabin_age_s", LASTS, who=least("cabin_ns")),
+    Row("battery_unknown", "no reading of a battery", "battery_age_s", LASTS, who=least("battery_ns")),
+    Row("battery_low", "battery low", "voltage_share", ": {:.0%} of its voltage", below=True, who=least("voltage_share")),
 )
 get_figures = attrgetter(*(row.figure for row in TABLE))
 """Returns the figure of every row, from the health of a tick."""
@@ -186,7 +199,9 @@ class Watch:
     def words(self, health: Health) -> str:
         """Returns its text with the present value."""
         value = getattr(health, self.row.figure)
-        return self.row.words if value >= NEVER_S else self.row.words + self.row.detail.format(value)
+        who = self.row.who(health) if health.reports.is_of_several else ""
+        detail = "" if value >= NEVER_S else self.row.detail.format(value)
+        return f"{self.row.words}{detail}{who and f' ({who})'}"
 
     def ending(self, health: Health, mode: Mode, armed: bool) -> str:
         """Returns its text when it ends: what has cleared; or that the cause lasts but no longer counts in this mode or while disarmed."""

@@ -19,6 +19,7 @@ from numba import njit
 from firmware_py.core.body import Body, deceleration_of, rank_by, rank_of
 from firmware_py.core.command_watch import CommandWatch
 from firmware_py.core.missing_thrust import MissingThrust
+from firmware_py.core.module_reports import name_modules
 from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import polynomial
 from firmware_py.core.thruster_names import name_of, places_of
@@ -247,15 +248,15 @@ class FaultDetector:
         self._silent = quiet if armed else []
         if self._silent == before:
             return
-        deaf = [str(self._modules[i]) for i in self._silent if self._watches[i].deaf and i not in before]
-        self.words += [f"module {', '.join(deaf)} obeys no commands: its thrusters stop"] if deaf else []
+        deaf = [self._modules[i] for i in self._silent if self._watches[i].deaf and i not in before]
+        self.words += [f"{name_modules(deaf)} obeys no commands: its thrusters stop"] if deaf else []
         alive, self.now = self.now.alive, self._usable_state()
         if not np.array_equal(alive, self.now.alive):
             self.changed = True
             self._motion.forget()
-            silent = ", ".join(str(self._modules[i]) for i in self._silent)
+            silent = name_modules(self._modules[i] for i in self._silent)
             less = bool((self.now.alive < self._obeys).any())
-            self.words.append(f"thrusters of silent module {silent} are left out" if less else "thrusters of every module are used again")
+            self.words.append(f"thrusters of silent {silent} are left out" if less else "thrusters of every module are used again")
 
     def _usable_state(self) -> ThrusterFaults:
         """Returns the fault state: all thrusters that obey, without those of silent modules where the others have the same rank."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from firmware_py.core.module_reports import ModuleReports
 from firmware_py.core.thruster_names import Place
 from firmware_py.core.types import DockRequest
 
@@ -106,6 +107,8 @@ class Health(NamedTuple):
     attitude_off_deg: float = 0.0
     """Angle between the body and its set-point, about axes that its thrusters can turn, deg; RMS over a second, because a body that swings
     passes its set-point again and again."""
+    reports: ModuleReports = ModuleReports([0])
+    """Of every module, the last ones: they go on changing. They name the modules behind the figures above."""
 
     @property
     def unseen_push_m_s(self) -> float:

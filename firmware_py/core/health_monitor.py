@@ -12,6 +12,7 @@ from firmware_py.core.body import Body, axes_without_thrust
 from firmware_py.core.faults import ESC_DOWN, ThrusterFaults, by_channel
 from firmware_py.core.fence import outside
 from firmware_py.core.health import Health
+from firmware_py.core.module_reports import ModuleReports
 from firmware_py.core.rotations import difference, rotate
 from firmware_py.core.thruster_names import Place, places_of
 from firmware_py.core.types import (
@@ -69,24 +70,6 @@ class _Latest:
     off_rad2: float = 0.0
 
 
-class PerModule:
-    """By fleet index: the last report of each module of the body, and its time, ns. A body inherits every table in it with its modules."""
-
-    def __init__(self, modules: Sequence[int]) -> None:
-        never = dict.fromkeys(modules, NEVER_NS)
-        self.heard_ns, self.hears_ns, self.answered_ns, self.late_ns = (never.copy() for _ in range(4))
-        self.imu_ns, self.battery_ns, self.cabin_ns, self.wet_ns = (never.copy() for _ in range(4))
-        self.pressure_ns = dict[int, int]()
-        self.unfit, self.leak, self.wet = (dict.fromkeys(modules, False) for _ in range(3))
-        self.voltage_share, self.cabin_c, self.cabin_start_pa, self.cabin_change_pa = (dict[int, float]() for _ in range(4))
-
-    def take_over(self, other: PerModule) -> None:
-        """Takes over every report of the modules of this body from a body before."""
-        mine = self.heard_ns.keys()
-        for name, reports in vars(self).items():
-            reports.update({module: told for module, told in getattr(other, name).items() if module in mine})
-
-
 class HealthMonitor:
     """Keeps the ages and running means of one body."""
 
@@ -100,7 +83,7 @@ class HealthMonitor:
         self._esc_ns = [NEVER_NS] * len(self._places)
         self._unknown_esc_ns: dict[Place, int] = {}
         """When an ESC was last heard that belongs to no thruster, by its place."""
-        self._reports = PerModule(body.modules)
+        self._reports = ModuleReports(body.modules)
         self._stopped_ns: dict[int, int] = {}
         """By fleet index: when a module last reported being held by an e-stop. A module that reports otherwise is removed."""
         self._latest = _Latest()
@@ -213,6 +196,7 @@ class HealthMonitor:
             still_s=min(at - self._reports.hears_ns[m] for m, at in self._reports.heard_ns.items()) * 1e-9,
             estop_box_age_s=_age_s(latest.estop_box_ns, now),
             attitude_off_deg=math.degrees(math.sqrt(latest.off_rad2)),
+            reports=self._reports,
         )
 
     def compare(self, setpoint: Setpoint, estimate: Estimate, keep: np.ndarray) -> None:

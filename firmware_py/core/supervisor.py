@@ -10,6 +10,7 @@ from firmware_py.core.arming import Question, against_arming, missing
 from firmware_py.core.failsafes import Failsafes, Level
 from firmware_py.core.health import Health
 from firmware_py.core.joints import modules_of
+from firmware_py.core.module_reports import name_modules
 from firmware_py.core.transitions import MODES, ROWS, TRIGGERS, Effect, Guard, Need, State, Transition, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Event, Mode, Request
 from firmware_py.description.parameters import Parameters
@@ -96,7 +97,7 @@ class Supervisor:
         if estop or (health.stopped and (self.armed or self._was_idle)):  # a module has heard an ESTOP that the firmware has not
             self._estop_ns = health.time_ns
             if not estop:
-                self._say(CRITICAL, f"e-stop: module {', '.join(map(str, health.stopped))} says that it heard one")
+                self._say(CRITICAL, f"e-stop: {name_modules(health.stopped)} says that it heard one")
             decisions.append(self._try(Trigger.ESTOP_FRAME, None, health))
         decisions += [self._try(trigger, None, health) for trigger in endings if self._applies(trigger, health)]
         decisions += [self._request(request, health) for request in requests]

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from firmware_py.core.body import Body
+from firmware_py.core.failsafes import TABLE, Watch
 from firmware_py.core.faults import ThrusterFaults
 from firmware_py.core.fence import outside
 from firmware_py.core.health import NEVER_S, Health
-from firmware_py.core.health_monitor import HealthMonitor, PerModule
+from firmware_py.core.health_monitor import HealthMonitor
+from firmware_py.core.module_reports import ModuleReports
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import exp
 from firmware_py.core.setpoint import rest_at
@@ -601,9 +603,42 @@ def test_push_is_known_to_a_body_that_two_have_become() -> None:
     assert joined.step(force_w=np.array([8.0, 0.0, 0.0])).push_m_s == pytest.approx(math.sqrt(8.0 / BODY.drag.mean), rel=1e-3)
 
 
+WELL = here(
+    gyro=ZERO, accel=ZERO, pressure_pa=1e5, voltage_v=12.0, leak=False, cabin_temperature_c=30.0, cabin_pressure_pa=1e5, mcu_state=2
+)  # fmt: skip
+UNWELL: dict[str, dict[str, Any]] = {
+    "leak": {"leak": True},
+    "battery_critical": {"voltage_v": 8.0},
+    "cabin_hot": {"cabin_temperature_c": 90.0},
+    "cabin_pressure": {"cabin_pressure_pa": 5e4},
+    "sensor_lost": {"pressure_pa": None},
+    "module_silent": {"heard": False, "answered": False, "mcu_state": None},
+    "module_late": {"answered": False},
+    "cabin_unknown": {"leak": None, "cabin_temperature_c": None, "cabin_pressure_pa": None},
+    "battery_unknown": {"voltage_v": None},
+    "battery_low": {"voltage_v": 10.0},
+}
+"""By fail-safe: what a module says that causes it."""
+
+
+@pytest.mark.parametrize("name", UNWELL)
+def test_fail_safe_names_the_modules_behind_it_in_a_body_of_several(name: str) -> None:
+    watch = Watch(next(row for row in TABLE if row.name == name), Parameters().failsafes)
+    unwell, words = dataclasses.replace(WELL, **UNWELL[name]), []
+    for one, three in ((WELL, unwell), (unwell, WELL), (unwell, unwell)):
+        pair, alone = MonitorBench(), MonitorBench(SINGLE)
+        for bench in (pair, alone):
+            bench.step(WELL, WELL)
+            for _ in range(300):
+                health = bench.step(one, three)
+            words.append(watch.words(health))
+            assert watch.beyond(health) or bench is alone
+    assert [text.partition(" (")[2] for text in words] == ["module 3)", "", "module 1)", "", "module 1, 3)", ""]
+
+
 def test_body_inherits_every_report_of_its_modules_and_of_no_other() -> None:
-    """A figure of a module that is added to PerModule needs no second place: forgotten there, it began anew at every dock."""
-    pair, one = PerModule([1, 3]), PerModule([3])
+    """A figure of a module that is added to ModuleReports needs no second place: forgotten there, it began anew at every dock."""
+    pair, one = ModuleReports([1, 3]), ModuleReports([3])
     for tables in vars(pair).values():
         tables.update({1: "told by 1", 3: "told by 3"})
     one.take_over(pair)
