@@ -23,8 +23,8 @@ VOLTAGE_RANGE = (0.6, 1.4)
 """Valid range of a voltage reading, as a share of the nominal voltage; a reading outside is replaced by the nominal voltage."""
 POWER_HALVINGS = 12
 """Bisection steps for the share of the forces that meets the supply limit."""
-EASED_STEP_N, EASED_S = 0.8, 0.2
-"""Slew limit, N per tick, while thrusters pass from one body's allocation to another's, and how long it applies."""
+EASED_N_PER_S, EASED_S = 80.0, 0.2
+"""Slew limit, N/s, while thrusters pass from one body's allocation to another's, and how long it applies, s."""
 
 
 class Limiter:
@@ -56,6 +56,7 @@ class Limiter:
             -np.array([polynomial(curve, 1.0) for curve in t.reverse]), np.array([polynomial(curve, 1.0) for curve in t.forward]),
         )  # fmt: skip
         self._step_n = parameters.slew_n_per_s * self._dt_s
+        self._eased_step_n = min(self._step_n, EASED_N_PER_S * self._dt_s)
         self._thrust_limits = None
         for magnets in self.magnets:
             magnets.retune(parameters)
@@ -89,7 +90,7 @@ class Limiter:
             self.force_n = np.zeros_like(self.force_n)
             return self.force_n, np.zeros_like(self.force_n)
         scale, wanted = self._voltage_scale(voltage_v), np.empty_like(self.force_n)
-        step_n = min(self._step_n, EASED_STEP_N) if self._eased else self._step_n
+        step_n = self._eased_step_n if self._eased else self._step_n
         self._eased = max(0, self._eased - 1)
         limit_forces(wanted_n, self.force_n, self._all if alive is None else alive, scale, *self._limits, step_n, wanted)
         powers = module_power(wanted, self._t.power_forward, self._t.power_reverse, self._t.module, len(self.magnets)).tolist()

@@ -119,12 +119,15 @@ def test_force_changes_no_faster_than_the_slew_limit(rich: Body, slew: float, si
             np.testing.assert_allclose(force, expected, atol=1e-12)
 
 
-def test_thrusters_that_pass_to_another_body_change_slowly_for_a_fifth_of_a_second(rich: Body) -> None:
-    limiter = Limiter(rich, parameters.Limiter(), DT)
+@pytest.mark.parametrize("rate_hz", [50, 100, 200, 400])
+def test_thrusters_that_pass_to_another_body_change_slowly_for_a_fifth_of_a_second(rich: Body, rate_hz: int) -> None:
+    """Regression: by 0.8 N in each tick, which was 40 N/s at 50 Hz, and no easing at all at 400 Hz."""
+    limiter, ticks = Limiter(rich, parameters.Limiter(), 1.0 / rate_hz), rate_hz // 5
     limiter.continue_from(np.full(16, 4.0))
-    forces = np.array([4.0, *(limiter.step(np.full(16, wanted), True, NOMINAL)[0][0] for wanted in [-8.0, 10.0] * 10 + [-8.0])])
-    np.testing.assert_allclose(np.abs(np.diff(forces[:21])), 0.8, atol=1e-12)
-    assert forces[20] - forces[21] == pytest.approx(2.0)
+    wanted = [-8.0, 10.0] * (ticks // 2) + [-8.0]
+    forces = np.array([4.0, *(limiter.step(np.full(16, each), True, NOMINAL)[0][0] for each in wanted)])
+    np.testing.assert_allclose(rate_hz * np.abs(np.diff(forces[: ticks + 1])), 80.0, atol=1e-9)
+    assert rate_hz * (forces[ticks] - forces[ticks + 1]) == pytest.approx(200.0)
 
 
 def test_eased_thrusters_change_no_faster_than_the_slew_limit_either(rich: Body) -> None:
