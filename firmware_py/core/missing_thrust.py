@@ -26,6 +26,8 @@ from firmware_py.description.water import GRAVITY
 DOWN = np.array([0.0, 0.0, 1.0])
 BLOCK_NS = 100_000_000
 """Length of an averaging block."""
+SAMPLE_NS = 10_000_000
+"""Longest time for which a sample of the accelerometer stands, or a tick if that is longer: an IMU may be slower than the tick."""
 RECENT, GAP, BASE = 5, 12, 30
 """Numbers of blocks: the mean of the last half second is compared with the mean of three seconds that ended 1.2 s before now."""
 LEAST_BASE = 5
@@ -81,7 +83,7 @@ class MissingThrust:
         self._plant = (body.mass, body.righting, body.drag.nodes, body.drag.rotational, body.drag.linear)
         self._columns = t.matrix.T.copy()
         self._across = across(body)
-        self._ticks = max(1, round(BLOCK_NS / period_ns))
+        self._ticks, self._sample_ticks = (max(1, round(ns / period_ns)) for ns in (BLOCK_NS, SAMPLE_NS))
         count = len(body.modules)
         gust = GUST_M_S * body.drag.cruise_slope
         moment = np.hypot(np.array([SIGMA_TILT, SIGMA_TILT, SIGMA_YAW]) * count, GUST_LEVER_M * gust)
@@ -155,15 +157,15 @@ class MissingThrust:
 
     def _close(self, estimate: Estimate) -> bool:
         """Ends the block and stores it; returns whether it is whole, that is, can be judged."""
-        n, accels, speed = len(self._seen), 0, 0.0
+        n, accels, told, last, speed = len(self._seen), 0, 0, 0, 0.0
         acceleration, model, coriolis, flow, forces = np.zeros(3), np.zeros(6), np.zeros(6), np.zeros(6), np.zeros(self._columns.shape[0])
-        for nu, q_wb, force_n, accel in self._seen:  # in one batch, while the code is in the processor's cache
+        for tick, (nu, q_wb, force_n, accel) in enumerate(self._seen, 1):  # in one batch, while the code is in the processor's cache
             speed += add_tick(nu, q_wb, force_n, *self._plant, self._across, model, coriolis, flow, forces)
             if accel is not None:
-                accels += 1
+                accels, told, last = accels + 1, told + min(tick - last, self._sample_ticks), tick
                 add_motion(accel, q_wb, acceleration)
         span = (self._last_n - self._first_n) * self._period_s
-        known = accels >= n // 2 and self._first is not None and span >= 0.5 * n * self._period_s
+        known = told >= n // 2 and self._first is not None and span >= 0.5 * n * self._period_s
         submerged = estimate.p_wb[2] > self._body.reach_m  # forces at the surface are not modelled here
         whole = known and submerged and self._free and estimate.tag_age_ns < FRESH_NS
         residual, acted = np.full(6, np.nan), self._columns.T @ (forces / n)

@@ -24,16 +24,18 @@ ZERO = np.zeros(3)
 class Water:
     """A robot that holds position by PD, in water that follows the model except for usual errors; ESC feedback at 10 Hz."""
 
-    def __init__(self, seed: int = 0, body: Body = BODY) -> None:
+    def __init__(self, seed: int = 0, body: Body = BODY, dt_s: float = DT) -> None:
         self.rng = np.random.default_rng(seed)
-        self.body, n = body, body.thrusters.f_max.size
-        self.detector = FaultDetector(body, Faults(), TICK_NS)
-        self.believed, self.acts = ThrusterLag(body.thrusters, DT), ThrusterLag(body.thrusters, DT)
+        self.body, self.dt_s, n = body, dt_s, body.thrusters.f_max.size
+        self.detector = FaultDetector(body, Faults(), round(dt_s * 1e9))
+        self.believed, self.acts = ThrusterLag(body.thrusters, dt_s), ThrusterLag(body.thrusters, dt_s)
         self.gain = self.rng.uniform(0.95, 1.05, n)
         self.deadband = self.rng.uniform(0.10, 0.25, n)
         self.speed_factor, self.stray_rpm = np.ones(n), np.zeros(n)
         self.status = np.zeros(n, dtype=int)
         self.heard = 1.0
+        self.imu_every = 1
+        """Ticks from one sample of the IMU to the next."""
         self.deaf: int | None = None
         """Module that says that it hears no commands."""
         self.accel_bias = np.full(3, 0.05)
@@ -51,8 +53,8 @@ class Water:
     def run(self, seconds: float, wanted: np.ndarray = PUSH, armed: bool = True) -> list[tuple[float, str]]:
         """Returns the faults found, each with the time since the start of this run, s."""
         found = []
-        for n in range(round(seconds / DT)):
-            found += [((n + 1) * DT, words) for words in self._step(wanted if armed else np.zeros(self.gain.size), armed)]
+        for n in range(round(seconds / self.dt_s)):
+            found += [((n + 1) * self.dt_s, words) for words in self._step(wanted if armed else np.zeros(self.gain.size), armed)]
         return found
 
     def _step(self, wanted: np.ndarray, armed: bool) -> list[str]:
@@ -65,7 +67,7 @@ class Water:
         self.acts.command(np.where(np.abs(wanted) < self.deadband, 0.0, wanted))
         b, tau = self.body, self.body.thrusters.matrix @ (self.gain * acting) + self.pushed
         felt = propagation.inertial_acceleration(self.x, tau, *b.plant)
-        self.x = propagation.step(self.x, tau, DT, *b.plant)
+        self.x = propagation.step(self.x, tau, self.dt_s, *b.plant)
         estimate = Estimate(
             self.x[:3].copy(), self.x[3:7].copy(), self.x[7:13].copy(), ZERO, ZERO, np.full(3, 0.002), np.full(3, 0.0009),
             self.tag_age_ns, 1.0, 6, 0, True,
@@ -74,7 +76,7 @@ class Water:
         weight = to_matrix(self.x[3:7].copy()).T @ np.array([0.0, 0.0, 9.80665])
         accel = felt - weight + self.accel_bias + 0.03 * self.rng.normal(size=3)
         measured = Measured(gyro, accel, None, [])
-        if self.rng.uniform() >= self.heard:
+        if self.rng.uniform() >= self.heard or self.tick % self.imu_every:
             measured = Measured(None, None, None, [])
         fleet = [ModuleInputs() for _ in range(max(b.modules) + 1)]
         for number, module in enumerate(b.modules):
@@ -92,7 +94,7 @@ class Water:
         """ESC frames of the module whose thrusters are `at` and the seven that follow."""
         frames = []
         for first in range(0, 8, 2):
-            if self.tick % 10 == first and self.rng.uniform() < self.heard:
+            if self.tick % round(0.1 / self.dt_s) == first and self.rng.uniform() < self.heard:
                 rpm = [
                     self.speed_factor[i] * self.detector.believed_rpm(i, float(self.acts.force_n[i]))
                     + self.stray_rpm[i] + 5.0 * self.rng.normal()

@@ -104,6 +104,16 @@ def test_lying_thruster_is_found_although_frames_are_lost() -> None:
     assert [words for _, words in water.run(2.0)] == ["thruster 1 of module 0 does not push as it says: left out"]
 
 
+@pytest.mark.parametrize(("rate_hz", "imu_hz"), [(50, 50), (100, 50), (200, 50), (400, 100), (400, 400)])
+def test_lying_thruster_is_found_by_an_imu_that_is_slower_than_the_tick(rate_hz: int, imu_hz: int) -> None:
+    """Regression: with samples in fewer than half of the ticks no thruster was judged."""
+    water = Water(seed=1, dt_s=1.0 / rate_hz)
+    water.imu_every = rate_hz // imu_hz
+    water.fly()
+    water.gain[0] = 0.0
+    assert [words for _, words in water.run(2.0)] == ["thruster 1 of module 0 does not push as it says: left out"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_healthy_robot_that_is_pushed_about_has_no_liar(seed: int) -> None:
