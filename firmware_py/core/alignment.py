@@ -21,6 +21,8 @@ acceleration passes this check and tilts the initial attitude, by ten degrees fo
 thrusters, corrects that within seconds."""
 AT_REST_RAD_S = 0.5
 """Largest mean angular rate for a body at rest: in half of the averaging window, 0.1 s, it turns the body by three degrees."""
+ENOUGH = 10
+"""Samples that tell gravity, however few of the ticks they are: an IMU may be slower than the tick."""
 AGREE_RAD, AGREE_M, AGREE_M_S, AGREE_S = 0.1, 0.1, 1.0, 1.0
 """Two tag poses agree if they differ by no more than this in heading (rad), position (m) and time (s). The position limit grows by
 AGREE_M_S (m/s) with the time between them, because a body that is assumed to stand still may move that fast. The heading limit is ten times
@@ -30,11 +32,11 @@ a tag's attitude noise; a flipped tag is off by twice the angle at which it is s
 def upright(gyros: np.ndarray, accels: np.ndarray) -> np.ndarray | None:
     """Returns the attitude (4,), heading 0, from the mean of (k, 3) specific forces, m/s^2; None where gravity cannot be isolated.
 
-    At least half of the samples of both kinds must be present (NaN marks a missing one), and by the specific forces and the (k, 3) angular
+    At least half of the samples of both kinds, or `ENOUGH`, must be present (NaN marks a missing one), and by the specific forces and the (k, 3) angular
     rates, rad/s, the body must be about at rest.
     """
     felt, turned = accels[~np.isnan(accels[:, 0])], gyros[~np.isnan(gyros[:, 0])]
-    if min(len(felt), len(turned)) < max(1, len(accels) // 2):
+    if min(len(felt), len(turned)) < max(1, min(ENOUGH, len(accels) // 2)):
         return None
     x, y, z = (-felt.mean(axis=0)).tolist()
     force = math.sqrt(x * x + y * y + z * z)

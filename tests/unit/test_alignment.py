@@ -99,6 +99,16 @@ def test_mean_is_taken_over_what_came() -> None:
     np.testing.assert_allclose(turned_back(found, np.array([0.0, 0.0, -G])), felt(Q_WB)[0], atol=1e-9)
 
 
+@pytest.mark.parametrize("imu_every", [1, 4, 8])
+def test_imu_that_is_slower_than_the_tick_feels_gravity(imu_every: int) -> None:
+    """Regression: with one of 100 Hz at 400 Hz, whose ticks of 0.2 s are 80, a robot without tags never had an attitude."""
+    came = np.arange(80)[:, None] % imu_every == 0
+    gyros, accels = (np.where(came, values, np.nan) for values in (np.zeros((80, 3)), felt(Q_WB, count=80)))
+    found = upright(gyros, accels)
+    assert found is not None
+    np.testing.assert_allclose(turned_back(found, np.array([0.0, 0.0, -G])), felt(Q_WB)[0], atol=1e-9)
+
+
 @pytest.mark.parametrize(("gyros", "accels"), [
     (STILL, felt(Q_WB, (0.0, 0.0, 0.51))),
     (STILL, felt(Q_WB, (0.0, 0.0, -0.51))),
