@@ -70,6 +70,24 @@ def test_offset_of_some_decimetres_is_learnt_in_half_a_second_and_never_reaches_
     assert told(gate, [3.34, 3.37], None) == [3.04, 3.07], "without tags it is still known"
 
 
+def test_sensor_that_is_heard_in_every_tick_at_400_hz_is_judged_as_one_at_50_hz() -> None:
+    """Regression: its offset counted as steady within 62 ms, and a picture that came 100 ms late was compared with none of its readings, so
+    that a robot followed a drift of 50 mm/s by 74 mm."""
+    gate, left_pa = DepthGate(single()), list[float | None]()
+    for tick in range(800):
+        now_ns, depth_m = tick * 2_500_000, 3.0 + 0.05 * max(0.0, tick / 400 - 1.0)
+        (left,) = gate.step(now_ns, [ModuleInputs(pressure_pa=pressure_at(depth_m))], AT_3_M._replace(depth_m=depth_m), armed=True)
+        left_pa.append(left.pressure_pa)
+        if tick % 7 == 0 and tick >= 40:
+            gate.compare([BodyPose(now_ns - 100_000_000, np.array([0.0, 0.0, 3.0]), np.zeros(3), from_euler(0.0, 0.0, 0.0), 1.0)])
+    assert sum(pa is not None for pa in left_pa[300:400]) in (14, 15), "57 a second"
+    assert not any(left_pa[700:]), "the tags tell that it drifts"
+    jumped = trusted()
+    later_ns = next(CLOCK)
+    left_m = [jumped.step(later_ns + n * 2_500_000, [ModuleInputs(pressure_pa=pressure_at(3.3))], AT_3_M, True)[0] for n in range(160)]
+    assert all(module.pressure_pa is None for module in left_m), "0.4 s are too short to learn an offset"
+
+
 def test_sensor_at_the_edge_of_the_gate_is_not_used_every_other_reading_for_ever() -> None:
     """In a body of four modules it cost 0.8 mm, because only the readings on one side of its noise were used."""
     gate, rng = trusted(), np.random.default_rng(0)
