@@ -12,10 +12,8 @@ from firmware_py.bus.mapping import ESTOP_BOX
 from firmware_py.bus.port import Port
 
 LISTEN_S = 0.6
-"""Listening time. A HEARTBEAT (2 Hz) comes once in it, a foreign SYNC (at least 50 Hz) within a fraction of it."""
-TICK_S = 0.01
-TICKS = 60
-"""Number of SYNCs sent: every slow message of a module but HEARTBEAT comes at least once in 200 ms."""
+"""Listening time, before SYNCs are sent and while they are. A HEARTBEAT (2 Hz) comes once in it, a foreign SYNC (at least 50 Hz) within a
+fraction of it, and every slow message of a module at least once in 200 ms, which are counted in ticks of the fleet's rate."""
 STATES = ("boot", "disarmed", "armed", "time-out of commands", "e-stop", "fault")
 FIT_STATES = (1, 2, 3)
 """Indices into STATES. A module in any other state turns no thruster when it is armed."""
@@ -55,22 +53,23 @@ class Seen:
     dropped: dict[str, int] = field(default_factory=dict)
 
 
-def look_at(port: Port, codec: Codec, wait: Callable[[float], None]) -> Seen:
-    """Listens to the bus; without a foreign SYNC, then sends TICKS SYNCs. `wait` sleeps for a number of seconds."""
+def look_at(port: Port, codec: Codec, rate_hz: int, wait: Callable[[float], None]) -> Seen:
+    """Listens to the bus; without a foreign SYNC, then sends SYNCs at `rate_hz`. `wait` sleeps for a number of seconds."""
     seen, receiver = Seen(), Receiver(codec)
+    tick_s, ticks = 1.0 / rate_hz, round(LISTEN_S * rate_hz)
     port.receive()
-    for _ in range(round(LISTEN_S / TICK_S)):
-        wait(TICK_S)
-        take(port, receiver, seen)
+    for _ in range(ticks):
+        wait(tick_s)
+        take(port, receiver, seen, tick_s)
     if not seen.sync:
         seen = Seen()
         sync = codec.message("SYNC")
-        for tick in range(TICKS):
+        for tick in range(ticks):
             frame = sync.encode(0, (tick,))
             port.send(frame)
             count(frame, seen)
-            wait(TICK_S)
-            take(port, receiver, seen)
+            wait(tick_s)
+            take(port, receiver, seen, tick_s)
     seen.dropped = {kind: number for kind, number in receiver.dropped.items() if number}
     return seen
 
@@ -81,9 +80,9 @@ def count(frame: Frame, seen: Seen) -> None:
     seen.frames += 1
 
 
-def take(port: Port, receiver: Receiver, seen: Seen) -> None:
-    """Takes the frames that arrived in one tick."""
-    seen.seconds += TICK_S
+def take(port: Port, receiver: Receiver, seen: Seen, tick_s: float) -> None:
+    """Takes the frames that arrived in one tick, of `tick_s`."""
+    seen.seconds += tick_s
     for frame in port.receive():
         count(frame, seen)
         received = receiver.accept(frame)
@@ -175,10 +174,11 @@ def expected_of(codec: Codec) -> set[str]:
 
 def judge_load(title: str, seen: Seen, numbers: list[int], rate_hz: int, codec: Codec) -> Finding:
     """Finding about the bus load now and the highest expected in flight."""
-    now = seen.bits / BIT_RATE / max(seen.seconds, TICK_S)
+    seconds = max(seen.seconds, 1.0 / rate_hz)
+    now = seen.bits / BIT_RATE / seconds
     load = bus_load(codec, numbers, rate_hz)
     text = (
-        f"{seen.frames / max(seen.seconds, TICK_S):.0f} frames/s, {100 * now:.0f} % of the bus; "
+        f"{seen.frames / seconds:.0f} frames/s, {100 * now:.0f} % of the bus; "
         f"in flight at {rate_hz} Hz {100 * load.mean:.0f} %, fullest tick {100 * load.fullest_tick:.0f} %"
     )
     if now > MEAN_LIMIT or not load.is_allowed:

@@ -43,7 +43,7 @@ def check_bus(
             return
     try:
         with open_port(address) as port:
-            seen = look_at(port, codec, wait)
+            seen = look_at(port, codec, rate_hz, wait)
     except PortError as error:
         yield Finding(title, FAILED, str(error), "see --bus, and the fleet file")
         return

@@ -36,6 +36,7 @@ from firmware_py.app.doctor_bus import WRONG, Seen, expected_of, judge, look_at
 from firmware_py.app.doctor_report import check_bus
 from firmware_py.app.service import reporting
 from firmware_py.bus.codec import Codec, Frame, load_database
+from firmware_py.bus.load import bus_load, is_of_a_module
 from firmware_py.bus.port import Port, open_port
 from firmware_py.core.types import Inputs, ModuleInputs, Outputs
 from firmware_py.runtime.clock import MonotonicClock
@@ -180,6 +181,22 @@ def test_module_that_answers_is_found_with_its_version_and_state(nodes: Nodes, f
     assert not np.any(nodes.world.truth(0).force_n)  # nothing moved
 
 
+@pytest.mark.parametrize("rate_hz", [50, 100, 200, 400])
+@pytest.mark.parametrize("number", [1, 18])
+def test_doctor_sends_sync_at_the_rate_of_the_fleet_by_which_modules_count_their_slow_messages(
+    number: int, rate_hz: int, far_end: Port
+) -> None:
+    """Regression: 60 SYNCs, of which module 18 sends its ENVIRONMENT with the 63rd at 400 Hz, and it was said to have a dead sensor."""
+    scenario = load_scenario("hover")
+    world = make_world(scenario, 0, 1_000_000_000 // rate_hz)
+    nodes = Nodes(world, CODEC, {number: 0}, scenario.sensors)
+    sent = [m for m in bus_load(CODEC, [number], rate_hz).messages if m.name == "SYNC" or is_of_a_module(CODEC.message(m.name))]
+    findings = list(check_bus(far_end.address, [number], rate_hz, CODEC, lambda seconds: answer(nodes, far_end)))
+    assert findings[0].state == OK, findings[0]
+    told = float(findings[-1].text.partition(" % of the bus")[0].rpartition(" ")[2])
+    assert told == pytest.approx(100 * sum(message.share for message in sent), abs=1)
+
+
 def test_module_that_is_silent_and_one_that_is_a_stranger_are_told(nodes: Nodes, far_end: Port) -> None:
     findings = list(check_bus(far_end.address, [2], 100, CODEC, lambda seconds: answer(nodes, far_end)))
     assert findings[0].state == FAILED and "module 2 is silent" in findings[0].text
@@ -189,7 +206,7 @@ def test_module_that_is_silent_and_one_that_is_a_stranger_are_told(nodes: Nodes,
 def test_doctor_sends_nothing_where_a_controller_runs(far_end: Port) -> None:
     sync = CODEC.message("SYNC")
     with open_port(far_end.address) as port:
-        seen = look_at(port, CODEC, lambda seconds: far_end.send(sync.encode(0, (1,))))
+        seen = look_at(port, CODEC, 100, lambda seconds: far_end.send(sync.encode(0, (1,))))
     assert far_end.receive() == []
     assert seen.sync > 0
     assert any("a controller runs on it" in finding.text for finding in judge("bus", seen, [], 100, CODEC))
@@ -215,7 +232,7 @@ def test_fault_of_an_e_stop_box_is_told_of_where_a_controller_runs(far_end: Port
             far_end.send(beat)
 
     with open_port(far_end.address) as port:
-        seen = look_at(port, CODEC, speak)
+        seen = look_at(port, CODEC, 100, speak)
     assert any("the e-stop box reports a fault of its own" in finding.text for finding in judge("bus", seen, [], 100, CODEC))
 
 
