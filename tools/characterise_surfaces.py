@@ -94,7 +94,7 @@ def _wrench(result: Capability, frame: str) -> Picture:
 
 
 def _outline(reach: Reach) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """Facets, or the border where two components are left, and those of the ellipsoid, in all three axes of the frame."""
+    """Facets, or the border where two components are left and the line where one is, and those of the ellipsoid, in all three axes."""
     assert reach.section is not None and reach.ellipsoid is not None
     shape, centre = reach.ellipsoid.shape, reach.ellipsoid.centre
     polygons = reach.section.polygons()
@@ -104,7 +104,7 @@ def _outline(reach: Reach) -> tuple[list[np.ndarray], list[np.ndarray]]:
     kept = [c % 3 for c in reach.section.components]
     border, inner = np.zeros((len(polygons[0]), 3)), np.zeros((_TURN, 3))
     border[:, kept] = polygons[0]
-    inner[:, kept] = np.stack([np.cos(turn), np.sin(turn)], axis=1) @ shape + centre
+    inner[:, kept] = np.stack([np.cos(turn), np.sin(turn)], axis=1)[:, : len(kept)] @ shape + centre
     return [border], [inner]
 
 

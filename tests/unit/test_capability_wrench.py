@@ -3,6 +3,7 @@
 import dataclasses
 import itertools
 
+import characterise_surfaces as surfaces
 import numpy as np
 import pytest
 
@@ -162,6 +163,17 @@ def test_vehicle_whose_thrusters_do_not_touch_its_passive_axis_is_characterised(
     assert found.unreachable == ("pitch",) and found.programs_differ < 1e-6
     assert found.power["torque"].residual == pytest.approx(1.0, abs=0.01), "a moment about pitch is missed whole"
     assert found.declared["torque"]["physical"].volume > 0.0
+
+
+def test_vehicle_with_two_passive_rotations_is_drawn_with_the_line_that_its_moments_fill() -> None:
+    """Regression: `characterise.py` ended in a traceback, for the outline of one component has no two axes to go round in."""
+    rov = load_vehicle("bluerov2")
+    found = summary.characterise(of_vehicle(dataclasses.replace(rov, passive_dof=("roll", "pitch"))), count=121, programs=False)
+    picture = surfaces.pictures(found)["wrench", "torque"]
+    (line,), reach = picture.polygons, found.declared["torque"][surfaces.NORMALISATION]
+    assert line.shape == (2, 3) and not line[:, :2].any() and reach.volume > 0.0
+    np.testing.assert_allclose(np.ptp(line[:, 2]), reach.volume)
+    np.testing.assert_allclose(np.ptp(np.concatenate(picture.ellipsoid)[:, 2]), reach.volume)
 
 
 @pytest.mark.parametrize(("name", "axis", "passive"), [("bluerov2", 0, 4), ("girona500", 1, 3)])

@@ -37,8 +37,10 @@ class Section:
         return np.asarray(ratio.min(axis=1))
 
     def polygons(self) -> list[np.ndarray]:
-        """Corners of each facet in order, (k, 3), in three dimensions; corners of the one outline, (k, 2), in two."""
+        """Corners of each facet in order, (k, 3), in three dimensions; of the one outline, (k, 2), in two; both ends, (2, 1), in one."""
         corners = corners_of(self.normals, self.offsets)
+        if len(self.components) == 1:
+            return [corners]
         if len(self.components) == 2:
             return [corners[np.argsort(np.arctan2(corners[:, 1], corners[:, 0]))]]
         tolerance = 1e-7 * float(np.abs(corners).max())
