@@ -15,6 +15,7 @@ from loop_response import BODIES, Scale, body_of, margins, measure
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError, build, did_you_mean, quantity, read_toml, repeated
+from firmware_py.description.vehicle import beside
 from hil.campaign import WALL_CLOCK
 from hil.metrics import SHOWN
 from hil.scenario import Scenario, load_scenario
@@ -28,7 +29,7 @@ FAILED_COST = 1e6
 class FlightSpec:
     """One flight of the objective."""
 
-    scenario: str = quantity(help="scenario name")
+    scenario: str = quantity(help="scenario name or file")
     vehicle: str = quantity("", help="vehicle name or file, in place of the scenario's")
     settle_s: float = quantity(0.0, unit="s", low=0, high=60, help="time that the robot holds its start before the task; 0: the scenario's")
     duration_s: float = quantity(0.0, unit="s", low=0, high=600, help="duration of the task; 0: the scenario's")
@@ -175,9 +176,14 @@ def check_terms(spec: FlightSpec, terms: Sequence[Term]) -> None:
 
 
 def load_objective(path: Path) -> Objective:
-    """Loads the objective from a file and checks its scenarios. Raises DescriptionError, one line."""
+    """Loads the objective from a file and checks its scenarios; their files and those of vehicles are looked up beside it, then in the
+    working directory. Raises DescriptionError, one line.
+    """
     table, source = read_toml(path)
     objective: Objective = build(Objective, table, source)
+    files = [{name: beside(path.parent, getattr(spec, name)) for name in ("scenario", "vehicle")} for spec in objective.flight]
+    flights = tuple(dataclasses.replace(spec, **names) for spec, names in zip(objective.flight, files, strict=True))
+    objective = dataclasses.replace(objective, flight=flights)
     checks = [("flight", i, partial(check_terms, spec, objective.term)) for i, spec in enumerate(objective.flight)]
     checks += [("stability", i, partial(body_of, each.modules, objective.vehicle)) for i, each in enumerate(objective.stability)]
     for table_name, i, check in checks:

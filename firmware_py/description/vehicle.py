@@ -346,7 +346,7 @@ def find_vehicles(modules: Sequence[_Module], source: Source) -> tuple[_Module, 
         DescriptionError: a vehicle cannot be loaded; names its line.
     """
     names: list[str] = [module.vehicle for module in modules]
-    found = {name: _beside(Path(source.path).parent, name) for name in names}
+    found = {name: beside(Path(source.path).parent, name) for name in names}
     for name, path in found.items():
         try:
             load_vehicle(path)
@@ -355,7 +355,7 @@ def find_vehicles(modules: Sequence[_Module], source: Source) -> tuple[_Module, 
     return tuple(dataclasses.replace(module, vehicle=found[module.vehicle]) for module in modules)
 
 
-def _beside(folder: Path, name: str) -> str:
-    """A vehicle's `name`; that of a file is prefixed with `folder`, unless the file exists in the working directory only."""
+def beside(folder: Path, name: str) -> str:
+    """A vehicle's or scenario's `name`; that of a file is prefixed with `folder`, unless it exists in the working directory only."""
     path = folder / name
     return str(path) if name.endswith(".toml") and (is_there(path) or not is_there(Path(name))) else name

@@ -246,6 +246,16 @@ def test_objective_that_makes_no_sense_is_refused(tools: tuple[Any, Any], tmp_pa
     assert "\n" not in str(refusal.value)
 
 
+def test_files_that_an_objective_names_lie_beside_it(tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever the search is started, as those of a scenario and of a fleet do."""
+    (tmp_path / "mine.toml").write_text((ROOT / "firmware_py" / "vehicles" / "bluerov2.toml").read_text())
+    (tmp_path / "still.toml").write_text((ROOT / "hil" / "scenarios" / "hover.toml").read_text())
+    named = re.sub('scenario = "[a-z-]+"', 'scenario = "still.toml", vehicle = "mine.toml"', OBJECTIVE)
+    monkeypatch.chdir(ROOT)
+    objective = objective_of(tools, tmp_path, named)
+    assert objective.vehicle == str(tmp_path / "mine.toml") and objective.flight[0].flown().name == "hover"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hover", "shipped", "spiral", "spiral-and-push"])
 def test_objectives_that_are_shipped_can_be_flown(tools: tuple[Any, Any], name: str) -> None:
