@@ -28,6 +28,7 @@ from firmware_py.description.schema import (
     refuse_folder,
     repeated,
 )
+from firmware_py.description.water import WATER_DENSITY
 
 _Module = TypeVar("_Module", bound=Any)
 
@@ -41,6 +42,10 @@ AXES = ("surge", "sway", "heave", "roll", "pitch", "yaw")
 
 MOST_DAMPING_PER_S = 50.0
 """Largest linear damping over mass or inertia, 1/s: half of that at which the firmware's midpoint rule is unstable at 50 Hz."""
+MOST_OVER_HULL = 1.1
+"""Largest mass, entrained water included, over that of the water in the hull's box: sea water, and parts that stick out of the box."""
+ON_FACE_M = 0.001
+"""Distance from a face of the hull's box within which a tag lies on it."""
 MOST_THRUSTERS = 8
 """Thrusters of one module for which its CAN frames have commands."""
 
@@ -181,6 +186,12 @@ class Tag:
         if abs(float(np.linalg.norm(self.quaternion)) - 1.0) > 1e-3:
             raise DescriptionError(f"quaternion {self.quaternion.tolist()} has not length 1", "quaternion")
 
+    @property
+    def outward(self) -> np.ndarray:
+        """(3,) unit vector towards who sees the tag, opposite to its z, module frame."""
+        w, x, y, z = self.quaternion
+        return np.array([-2.0 * (x * z + w * y), -2.0 * (y * z - w * x), 2.0 * (x * x + y * y) - 1.0])
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Supply:
@@ -297,7 +308,7 @@ def too_many_thrusters() -> str:
 
 def _check_body(vehicle: Vehicle, source: Source) -> None:
     """Raises DescriptionError, which names the line, if the body is impossible, or its name cannot be a file name."""
-    passive, com, half = vehicle.passive_dof, vehicle.inertial.com_m, 0.5 * vehicle.hull.size_m
+    passive = vehicle.passive_dof
     if not is_file_name(vehicle.name):
         raise source.error(("name",), f"{vehicle.name!r} cannot be the name of a file; give one without separators")
     for i in repeated(passive):
@@ -307,9 +318,29 @@ def _check_body(vehicle: Vehicle, source: Source) -> None:
     if len(vehicle.thruster) > MOST_THRUSTERS:
         what = f"{len(vehicle.thruster)} thrusters; {too_many_thrusters()}"
         raise source.error(("thruster", MOST_THRUSTERS), what)
-    if not vehicle.hull.mesh and np.any(np.abs(com) > half):
-        what = f"{com.tolist()} m is outside the hull, a box of {' x '.join(f'{edge:g}' for edge in vehicle.hull.size_m)} m about [0, 0, 0]"
-        raise source.error(("inertial", "com_m"), what)
+    tips = [name for name in passive if name in ("roll", "pitch")]
+    if tips and vehicle.inertial.righting_arm_m <= 0.0:
+        what = f"with {vehicle.inertial.righting_arm_m:g} m buoyancy does not right the vehicle, which leaves {' and '.join(tips)} to it"
+        raise source.error(("inertial", "righting_arm_m"), f"{what} (passive_dof); it must be above 0")
+    if not vehicle.hull.mesh:
+        _check_box(vehicle, source)
+
+
+def _check_box(vehicle: Vehicle, source: Source) -> None:
+    """Raises DescriptionError, which names the line, if mass, centre of mass or a tag does not fit the hull, a box."""
+    half, com, wet_kg = 0.5 * vehicle.hull.size_m, vehicle.inertial.com_m, vehicle.inertial.wet_kg
+    box = f"the hull, a box of {' x '.join(f'{edge:g}' for edge in vehicle.hull.size_m)} m"
+    if np.any(np.abs(com) > half):
+        raise source.error(("inertial", "com_m"), f"{com.tolist()} m is outside {box} about [0, 0, 0]")
+    water_kg = WATER_DENSITY * float(np.prod(vehicle.hull.size_m))
+    if wet_kg > MOST_OVER_HULL * water_kg:
+        what = f"{wet_kg:g} kg, entrained water included, cannot float: {box}, displaces {water_kg:.3g} kg of water"
+        raise source.error(("inertial", "dry_kg"), what)
+    for i, tag in enumerate(vehicle.tag):
+        on = np.abs(np.abs(tag.position_m) - half) < ON_FACE_M
+        if on.any() and np.max((tag.outward * np.sign(tag.position_m))[on]) < 0.0:
+            what = "looks into the hull from the face that the tag lies on; its z must point into the hull, away from who sees it"
+            raise source.error(("tag", i, "quaternion"), what)
 
 
 def _check_drag(drag: Drag, source: Source) -> None:

@@ -250,12 +250,24 @@ def changed(folder: Path, old: str, new: str, count: int = 1) -> Path:
         ('faces = "P', 'passive_dof = ["roll", "pitch", "roll"]\nfaces = "P', r"odd.toml:5: passive_dof: roll is there twice"),
         ('faces = "P', f'passive_dof = {["surge", "sway", "heave", "roll", "pitch", "yaw"]}\nfaces = "P', "passive_dof: all six are left"),
         ("com_m = [0.0, 0.0, 0.0]", "com_m = [0, 0, 0.11]", r"toml:16: inertial.com_m: \[0.0, 0.0, 0.11\] m is outside the hull"),
+        ("dry_kg = 2.6", "dry_kg = 26", r"toml:14: inertial.dry_kg: 32.7 kg, .* cannot float: the hull, .* displaces 9.24 kg of water"),
+        ("position_m = [0.105, 0.0, 0.0]", "position_m = [-0.105, 0, 0]", r"odd.toml:\d+: tag\[0\].quaternion: looks into the hull"),
         ("id = 0", "id = 16", r"tag\[0\].id: 16 is out of range; permitted: 0 to 15"),
     ],
 )  # fmt: skip
 def test_odd_vehicle_is_refused(tmp_path: Path, old: str, new: str, words: str) -> None:
     with pytest.raises(DescriptionError, match=words):
         load_vehicle(str(changed(tmp_path, old, new)))
+
+
+@pytest.mark.parametrize("arm_m", [0.0, -0.005])
+def test_rotation_that_buoyancy_does_not_right_is_not_left_to_it(tmp_path: Path, arm_m: float) -> None:
+    """A bench flight of such a vehicle capsized in three seconds, 134 deg off."""
+    path = changed(tmp_path, "righting_arm_m = 0.005", f"righting_arm_m = {arm_m}")
+    assert load_vehicle(str(path)).inertial.righting_arm_m == arm_m
+    path.write_text('passive_dof = ["surge", "pitch"]\n' + path.read_text())
+    with pytest.raises(DescriptionError, match=r"toml:20: inertial.righting_arm_m: with .* which leaves pitch to it"):
+        load_vehicle(str(path))
 
 
 def test_vehicle_with_more_thrusters_than_its_frames_carry_is_refused_at_the_first_that_is_too_many(tmp_path: Path) -> None:
