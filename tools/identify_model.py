@@ -149,6 +149,8 @@ class Equations:
         self._nodes = _drag_nodes(vehicle)
         self._loaded = _share(self.time_s, weight)
         self._load = weight or Weight(0.0, 0.0, 0.0, 0.0)
+        self._centre = recording.body.r_bm[0]
+        self._added_share = vehicle.inertial.added[:3] / np.diag(recording.body.mass)[:3]
         self._hung = recording.body.r_bm[0] + hung_at(self._load, vehicle)
         self._kept: dict[object, tuple[bytes, object]] = {}
 
@@ -163,13 +165,18 @@ class Equations:
         v, drags = self._once("drag", np.concatenate([x["current"], x.get("gust", NO_GUST)]), self._drag)
         w, mass, inertia = self._w, np.exp(x["mass"]), np.exp(x["inertia"])
         tau = (thrust * x["gain"]) @ self._matrix.T
-        force = tau[:, :3] + x["drag"][0] * drags[0] + x["drag"][1] * drags[1]
-        force = force + (x["weight"] + self._load.newton * self._loaded)[:, None] * self._down
+        drag = x["drag"][0] * drags[0] + x["drag"][1] * drags[1]
+        force = tau[:, :3] + drag + (x["weight"] + self._load.newton * self._loaded)[:, None] * self._down
         a, turned, s = self.measured[:, :3] - x["bias"], self.measured[:, 3:], x["offset"]
         force = force - _cross(turned, s) - _cross(w, _cross(w, s)) + mass * _cross(w, v) - _cross(w, mass * v)
         speed = np.abs(v)
         damping = x["rotational"] * np.linalg.norm(w, axis=1, keepdims=True) + x["crossflow"] * (speed.sum(axis=1, keepdims=True) - speed)
         moment = tau[:, 3:] - damping * w - _cross(x["arm"], self._down) - _cross(s, a) - _cross(w, inertia * w)
+        moment = moment + _cross(self._centre, drag)
+        turning, water = mass * self._added_share * _cross(w, self._centre), mass * self._added_share
+        force = force - water * _cross(turned, self._centre) - _cross(w, turning)
+        swum = _cross(self._centre, water * (a - _cross(w, v))) + _cross(w, _cross(self._centre, water * v))
+        moment = moment - swum - _cross(v, turning)
         load = self._loaded[:, None] * (self._load.newton * self._down - self._load.kg * a)
         moment = moment - _cross(v, mass * v) + _cross(self._hung, load)
         return np.hstack([force / (mass + self._load.kg * self._loaded[:, None]) + x["bias"], moment / inertia])
@@ -196,8 +203,9 @@ class Equations:
         """(n, 3) velocity through the water of a mean (3,) and gusts, and the (n, 3) force for coefficients (1, 0) and (0, 1)."""
         gusts = at[3:].reshape(-1, 3)
         v = _to_body(self._q, self._v_w - at[:3] - self.knots[:, : len(gusts)] @ gusts)
-        speed = np.linalg.norm(v, axis=1, keepdims=True)
-        return v, [-np.array([look_up(nodes, row)[:1] for row in np.ascontiguousarray(v)]) * speed * v for nodes in self._nodes]
+        flow = np.ascontiguousarray(v + _cross(self._w, self._centre))
+        speed = np.linalg.norm(flow, axis=1, keepdims=True)
+        return v, [-np.array([look_up(nodes, row)[:1] for row in flow]) * speed * flow for nodes in self._nodes]
 
     def _seen(self, series: np.ndarray) -> np.ndarray:
         """Filters a series of all ticks with the window and samples it at the rows."""

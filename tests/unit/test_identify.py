@@ -16,6 +16,7 @@ import identify_quantities as quantities
 import numpy as np
 import pytest
 
+from firmware_py.core import rigid_body
 from firmware_py.core.rotations import exp, rotate, rotate_back
 from firmware_py.core.types import BodyPose
 from firmware_py.description.parameters import Estimation
@@ -244,11 +245,40 @@ def test_rows_at_the_surface_are_left_out_and_a_log_of_nothing_else_is_refused()
 
 def hang(flight: model.Equations, x: dict[str, np.ndarray], lever: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """(n, 6) measurements with the weight at `lever` from the centre of mass; in `flight` it hangs at the centre of mass itself."""
-    flight.measured = flight.predict(x) + noise
-    pull = flight._loaded[:, None] * (2.0 * flight._down - 0.22 * flight.measured[:, :3])
-    moved = flight.predict(x) + noise
-    moved[:, 3:] += np.cross(lever, pull) / np.exp(x["inertia"])
-    return np.asarray(moved)
+    for _ in range(20):  # the prediction depends on the measurement
+        pull = flight._loaded[:, None] * (2.0 * flight._down - 0.22 * flight.measured[:, :3])
+        turned = np.cross(lever, pull) / np.exp(x["inertia"])
+        flight.measured = flight.predict(x) + noise + np.hstack([np.zeros_like(turned), turned])
+    return flight.measured
+
+
+def test_added_mass_of_a_hull_beside_the_centre_of_mass_moves_and_turns_as_in_the_firmware() -> None:
+    """With neither thrust, drag nor righting, by the firmware's mass and Coriolis matrices. Without the coupling a vehicle whose weight
+    is 3 cm below the middle of its hull was found a tenth too light, with five times its inertia in pitch.
+    """
+    flight = made_up(com_m=(0.0, 0.0, 0.03))
+    body, forces = assemble_vehicle(flight.vehicle), ("gain", "drag", "rotational", "arm")
+    x = model.initial_values(flight.vehicle) | {"current": np.zeros(3), "bias": np.zeros(3)}
+    x |= {name: 0.0 * x[name] for name in forces}
+    for _ in range(40):  # the prediction depends on the measurement
+        flight.measured = flight.predict(x)
+    v, _ = flight._drag("drag", np.zeros(3))
+    for i, (velocity, rate) in enumerate(zip(v, flight._w, strict=True)):
+        nu, speeding = np.concatenate([velocity, rate]), flight.measured[i].copy()
+        speeding[:3] -= np.cross(rate, velocity)
+        coriolis = np.zeros(6)
+        rigid_body.take_coriolis(body.mass, nu, coriolis)
+        np.testing.assert_allclose(body.mass @ speeding, coriolis, atol=1e-9)
+
+
+def test_drag_of_a_hull_beside_the_centre_of_mass_turns_it() -> None:
+    """It acts in the middle of the hull, in the flow that is there."""
+    flight = made_up(com_m=(0.0, 0.0, 0.03))
+    x = model.initial_values(flight.vehicle) | {"current": np.zeros(3), "bias": np.zeros(3)}
+    with_drag, without = flight.predict(x), flight.predict(x | {"drag": np.zeros(2)})
+    force, moment = np.split((with_drag - without) * np.exp(np.concatenate([x["mass"], x["inertia"]])), 2, axis=1)
+    np.testing.assert_allclose(moment, np.cross([0.0, 0.0, -0.03], force), atol=1e-9)
+    assert np.abs(moment).max() > 1e-3
 
 
 @pytest.mark.slow
