@@ -77,7 +77,7 @@ class Fit:
 def fit(flights: Sequence[Equations], reference: Reference | None = None, has_weight: bool = False) -> Fit:
     """Fits all flights of one vehicle at once; without `reference` and weight the mean gain is defined as 1."""
     vehicle = flights[0].vehicle
-    mine = unknowns(len(vehicle.thruster))
+    mine = unknowns(vehicle)
     shared, count = slices_by_name(mine), sum(u.size for u in mine)
     parts, own = _with_nuisances(mine, flights)
     gusts = [np.kron(gust_precision(flight.knots.shape[1]), np.eye(3)) for flight in flights]

@@ -35,6 +35,8 @@ HALF_WINDOW = 5
 DEADBAND_EDGE_N = 0.01
 """Width of the smoothed edge of a thruster's deadband, which makes the deadband searchable by slopes."""
 SHORTEST_LAG_S = 0.005
+MODULE_KG, MODULE_M = 15.5, 0.21
+"""Total mass and edge of the module for which the widths of the priors were chosen."""
 NO_GUST = np.zeros(0)
 DOWN = np.array([0.0, 0.0, 1.0])
 GUST_S = 5.0
@@ -53,13 +55,15 @@ class Unknown(NamedTuple):
     """Step of the finite differences."""
 
 
-def unknowns(thrusters: int) -> tuple[Unknown, ...]:
-    """Unknowns of the vehicle. mass, inertia: logarithms of the totals; SI units.
+def unknowns(vehicle: Vehicle) -> tuple[Unknown, ...]:
+    """Unknowns of the vehicle. mass, inertia: logarithms of the totals; SI units. Widths: a module's, in proportion to mass and size.
 
     shape: errors of the curve's shape. Shares of the force: reverse against forward, small commands against full ones, forward and in
     reverse; then the force missing at small commands, N, forward and in reverse. A load cell with 0.02 N of noise is off by some per cent
     at the forces of a hovering robot, which would bias the gains of thrusters that push one way against those that push the other.
     """
+    thrusters, heavier = len(vehicle.thruster), float(np.diag(assemble_vehicle(vehicle).mass)[:3].mean()) / MODULE_KG
+    larger = math.cbrt(float(np.prod(vehicle.hull.size_m))) / MODULE_M
     return (
         Unknown("mass", 3, 1.0),
         Unknown("inertia", 3, 1.0),
@@ -68,11 +72,11 @@ def unknowns(thrusters: int) -> tuple[Unknown, ...]:
         Unknown("lag", 1, 0.1),
         Unknown("shape", 5, 0.05),
         Unknown("drag", 2, 1.0),
-        Unknown("rotational", 3, 0.05),
-        Unknown("crossflow", 3, 0.5),
-        Unknown("arm", 3, 0.5),
-        Unknown("weight", 1, 5.0),
-        Unknown("offset", 3, 0.1),
+        Unknown("rotational", 3, 0.05 * larger**5),
+        Unknown("crossflow", 3, 0.5 * larger**4),
+        Unknown("arm", 3, 0.5 * heavier * larger),
+        Unknown("weight", 1, 5.0 * heavier),
+        Unknown("offset", 3, 0.1 * heavier * larger),
     )
 
 

@@ -281,6 +281,16 @@ def test_drag_of_a_hull_beside_the_centre_of_mass_turns_it() -> None:
     assert np.abs(moment).max() > 1e-3
 
 
+def test_priors_are_as_wide_as_the_vehicle_is_heavy_and_large() -> None:
+    """Those of a module's damping held the turning of a vehicle of half a metre for inertia."""
+    small = load_vehicle("modcube")
+    large = dataclasses.replace(small, hull=dataclasses.replace(small.hull, size_m=frozen_array(2.0 * small.hull.size_m)))
+    module, twice = ({unknown.name: unknown.width for unknown in model.unknowns(vehicle)} for vehicle in (small, large))
+    assert module["rotational"] == pytest.approx(0.05) and twice["rotational"] == pytest.approx(0.05 * 2**5)
+    assert module["crossflow"] == pytest.approx(0.5) and twice["crossflow"] == pytest.approx(0.5 * 2**4)
+    assert module["arm"] == pytest.approx(0.5) and twice["arm"] == pytest.approx(1.0) and twice["gain"] == module["gain"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("at_m", [None, (0.0, 0.0, 0.0), (0.1, -0.05, 0.03)])
 def test_weight_that_pulls_at_an_arm_is_not_taken_for_righting(at_m: tuple[float, float, float] | None) -> None:
