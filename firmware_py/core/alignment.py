@@ -32,8 +32,8 @@ a tag's attitude noise; a flipped tag is off by twice the angle at which it is s
 def upright(gyros: np.ndarray, accels: np.ndarray) -> np.ndarray | None:
     """Returns the attitude (4,), heading 0, from the mean of (k, 3) specific forces, m/s^2; None where gravity cannot be isolated.
 
-    At least half of the samples of both kinds, or `ENOUGH`, must be present (NaN marks a missing one), and by the specific forces and the (k, 3) angular
-    rates, rad/s, the body must be about at rest.
+    At least half of the samples of both kinds, or `ENOUGH`, must be present (NaN marks a missing one), and by the specific forces and the
+    (k, 3) angular rates, rad/s, the body must be about at rest.
     """
     felt, turned = accels[~np.isnan(accels[:, 0])], gyros[~np.isnan(gyros[:, 0])]
     if min(len(felt), len(turned)) < max(1, min(ENOUGH, len(accels) // 2)):
