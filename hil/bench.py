@@ -31,6 +31,7 @@ from hil.orders import Orders
 from hil.plant.world import World
 from hil.scenario import Scenario, make_world
 from hil.script import Script
+from hil.starts import pitch_of
 from hil.truth_log import TruthRecorder
 
 LOOK_S = 0.005
@@ -121,7 +122,7 @@ def fleet_of(scenario: Scenario, bus: str = DEFAULT_BUS, rate_hz: int = USUAL_RA
     modules = tuple(
         Module(number=m.number, vehicle=m.vehicle, body=m.body, cell=m.cell, rotation=m.rotation) for m in scenario.module
     )
-    return Fleet(module=modules, buses=(bus,), rate_hz=rate_hz)
+    return Fleet(module=modules, buses=(bus,), rate_hz=rate_hz, pitch_m=pitch_of(scenario))
 
 
 def script_of(scenario: Scenario, fleet: Fleet) -> Orders:

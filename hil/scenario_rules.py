@@ -14,7 +14,7 @@ from firmware_py.description.vehicle import FACE_NAMES, Vehicle, face_mismatch, 
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
 from hil.metrics import AS_ASKED, DOCKING, SHOWN, shown
-from hil.starts import MOVE_IN, hulls_in_walls, inscribed_radius_m, remedy, sphere_in_wall
+from hil.starts import MOVE_IN, docking_edges_of, hulls_in_walls, inscribed_radius_m, remedy, sphere_in_wall
 
 if TYPE_CHECKING:
     from hil.scenario import Check, Scenario
@@ -104,6 +104,13 @@ def _in_numbers(scenario: Scenario) -> Iterator[Mistake]:
     for i, number in enumerate(numbers):
         if number in numbers[:i]:
             yield ("module", i, "number"), f"{number} is the number of another module too; each needs one of its own"
+
+
+def _in_pitch(scenario: Scenario) -> Iterator[Mistake]:
+    edges = sorted(docking_edges_of(scenario))
+    if len(edges) > 1 and len(module_numbers(scenario)) > 1:
+        what = f"docking faces are {' and '.join(f'{edge:g}' for edge in edges)} m apart across the hulls; a lattice has one pitch"
+        yield ("module", 0, "vehicle"), f"{what}: give modules with equal edges along the axes of their docking faces"
 
 
 def _in_polycube(scenario: Scenario) -> Iterator[Mistake]:
@@ -327,7 +334,7 @@ def _out_of_reach(check: Check) -> Iterator[tuple[str, str]]:
 
 
 RULES = (
-    _in_name, _in_numbers, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_clamps, _in_docked, _in_cells, _in_tank,
-    _in_moves, _in_start, _in_mentions, _in_faces, _in_undocks, _in_tags, _in_faults, _in_checks,
+    _in_name, _in_numbers, _in_pitch, _in_polycube, _in_steps, _in_settling, _in_file, _in_bodies, _in_clamps, _in_docked, _in_cells,
+    _in_tank, _in_moves, _in_start, _in_mentions, _in_faces, _in_undocks, _in_tags, _in_faults, _in_checks,
 )  # fmt: skip
 """In order of priority: the first mistake found is the one reported."""

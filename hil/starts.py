@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from hil.scenario import Scenario
 
 PITCH_M = 0.21
-"""Lattice pitch of docked modules (the paper's)."""
+"""Lattice pitch of modules without docking faces (the paper's)."""
 CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
 """(8, 3) corners of a box, as shares of its edges."""
 MOVE_IN = "move it in"
@@ -29,10 +29,20 @@ TOUCHING_M = 1e-9
 """Tolerance for a hull that touches a wall, against rounding."""
 
 
+def pitch_of(scenario: Scenario) -> float:
+    """Lattice pitch, m: docked hulls touch, so it is the edge of the modules' hulls along the axes of their docking faces."""
+    return next(iter(docking_edges_of(scenario)), PITCH_M)
+
+
+def docking_edges_of(scenario: Scenario) -> set[float]:
+    """Edges of all modules' hulls, m, along the axes of their docking faces: one alone where every face meets every other."""
+    return set[float]().union(*(load_vehicle(name).docking_edges_m for name in {m.vehicle for m in scenario.module}))
+
+
 def places_of(scenario: Scenario) -> list[Place]:
     """Seat of each module in its body, whose frame has its origin at the leader's cell."""
-    leaders = {m: members[0] for members in scenario.groups for m in members}
-    return [place(m.cell, m.rotation, PITCH_M, np.array(scenario.module[leaders[i]].cell)) for i, m in enumerate(scenario.module)]
+    leaders, pitch_m = {m: members[0] for members in scenario.groups for m in members}, pitch_of(scenario)
+    return [place(m.cell, m.rotation, pitch_m, np.array(scenario.module[leaders[i]].cell)) for i, m in enumerate(scenario.module)]
 
 
 def starts_of(scenario: Scenario, vehicles: Sequence[Vehicle], bodies: Sequence[Start]) -> list[Start]:

@@ -255,6 +255,11 @@ class Vehicle:
         return np.array([t.direction / np.linalg.norm(t.direction) for t in self.thruster])
 
     @property
+    def docking_edges_m(self) -> set[float]:
+        """Edges of the hull, m, along the axes on which it has docking faces."""
+        return {float(edge) for axis, edge in enumerate(self.hull.size_m) if set(self.faces[2 * axis : 2 * axis + 2]) & set("PD")}
+
+    @property
     def cd_corner(self) -> float:
         """Drag coefficient along a space diagonal, from the face and edge values (quartic cubic harmonic)."""
         return (4.0 * self.drag.cd_edge - self.drag.cd_face) / 3.0

@@ -28,6 +28,7 @@ from hil.scenario import Scenario, Step, load_scenario, make_world
 from hil.scenario_files import scenario_names
 from hil.scenario_rules import metric_names
 from hil.script import Script
+from hil.starts import places_of
 from tests.unit.tanks import FaultyTank
 
 FOLDER = Path(load_scenario.__code__.co_filename).parent / "scenarios"
@@ -453,3 +454,24 @@ def test_vehicle_file_is_looked_up_beside_the_scenario_s(load: Load, tmp_path: P
     assert world.vehicles[0].inertial.dry_kg == 2.5
     assert vehicles_of(fleet_of(scenario, "virtual:own", 100)).popitem()[1].inertial.dry_kg == 2.5
     assert identity(scenario, Parameters())
+
+
+@pytest.mark.parametrize("name", ["dock", "mobius-2"])
+def test_modules_of_another_size_dock_on_the_bench_where_their_hulls_touch(name: str, tmp_path: Path) -> None:
+    """Cubes of 200 mm gave up after four tries, "jam": the firmware looked for each other's centres a module's 210 mm apart."""
+    text = (resources.files("firmware_py") / "vehicles" / "modcube.toml").read_text(encoding="utf-8")
+    for old, new in (("size_m = [0.21, 0.21, 0.21]", "size_m = [0.2, 0.2, 0.2]"), ("entrained_kg = 6.7", "entrained_kg = 5.0")):
+        text = text.replace(old, new)
+    (tmp_path / "small.toml").write_text(text, encoding="utf-8")
+    scenario = load_scenario(name).with_vehicle(str(tmp_path / "small.toml"))
+    assert fleet_of(scenario).pitch_m == 0.2 and fleet_of(load_scenario(name)).pitch_m == 0.21
+    seats = [place.position for place in places_of(scenario)]
+    assert np.linalg.norm(seats[1] - seats[0]) == pytest.approx(0.2 if name == "mobius-2" else 0.0)
+
+
+def test_modules_that_no_one_lattice_holds_are_refused(load: Load, tmp_path: Path) -> None:
+    text = (resources.files("firmware_py") / "vehicles" / "modcube.toml").read_text(encoding="utf-8")
+    (tmp_path / "long.toml").write_text(text.replace("size_m = [0.21, 0.21, 0.21]", "size_m = [0.25, 0.21, 0.21]"), encoding="utf-8")
+    with pytest.raises(DescriptionError, match=r"docking faces are 0\.21 and 0\.25 m apart across the hulls; a lattice has one pitch"):
+        load("dock", 'vehicle = "modcube"', 'vehicle = "long.toml"')
+    assert load("hover", 'vehicle = "modcube"', 'vehicle = "long.toml"')
