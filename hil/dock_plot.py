@@ -117,4 +117,5 @@ def _conditions(axes: Any, time_s: np.ndarray, rows: Columns) -> None:
         row = starts[k]
         name = STAGES[int(rows["stage"][row])] + (f"\ntry {rows['tries'][row]}" if again else "")
         if row == starts[-1] or till_s - begin_s > LEAST_SHARE * duration_s:
-            axes.text(0.5 * (begin_s + till_s), 2.5, name, ha="center", va="center", fontsize=8)
+            at_s, ha = (0.5 * (begin_s + till_s), "center") if k else (begin_s, "left")  # centred, it may begin on the axis's own words
+            axes.text(at_s, 2.5, name, ha=ha, va="center", fontsize=8)

@@ -34,6 +34,15 @@ def test_last_stage_is_named_though_it_lasts_one_tick_and_others_where_there_is_
     pyplot.close(figure)
 
 
+def test_first_stage_is_named_within_the_axes_however_short_it_is() -> None:
+    """Regression: after four tries "pre-approach" lay on the word "stage" beside the axis."""
+    figure = docking(*flown({"pre-approach": 50, "align": 20, "approach": 1000, "docked": 1}), 0)
+    figure.draw_without_rendering()
+    first, second = (text.get_window_extent() for text in figure.axes[2].texts[:2])
+    assert first.x0 >= figure.axes[2].get_window_extent().x0 and not first.overlaps(second)
+    pyplot.close(figure)
+
+
 def test_stages_tell_their_try_where_there_are_several() -> None:
     docks, truth = flown({"approach": 60, "back off": 60, "docked": 1})
     figure = docking(docks | {"tries": np.repeat([1, 2], [60, 61])}, truth, 0)
