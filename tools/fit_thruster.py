@@ -216,6 +216,8 @@ def main() -> int:
         idle_w = idle_power(points, given.zero)
         taken = "none was measured at zero command: nothing taken off" if idle_w is None else f"{idle_w:.3g} W at zero command taken off"
         print(f"power: {taken} for the electronics, which the vehicle file's idle_w counts")
+    power = "" if "power_w" in points else "power, "
+    print(f"not measured, those of {given.vehicle}: {power}lag_s {curve.lag_s:g} s, rpm_at_full {curve.rpm_at_full:g} 1/min")
     return 0
 
 

@@ -87,7 +87,9 @@ def test_file_that_is_written_is_a_vehicle_files_curve(
     source.write_bytes(mark + source.read_bytes())
     monkeypatch.setattr(sys, "argv", ["fit_thruster", str(source), "--out", str(out)])
     assert tool.main() == 0
-    assert "1.5 W at zero command taken off" in capsys.readouterr().out
+    told = capsys.readouterr().out
+    assert "1.5 W at zero command taken off" in told
+    assert "not measured, those of modcube: lag_s 0.08 s, rpm_at_full 3000 1/min" in told
     table, where = read_toml(out)
     curve = build(ThrusterCurve, table, where)
     assert np.sum(curve.forward) == pytest.approx(np.sum(LIKE.forward), rel=0.01)
