@@ -20,8 +20,8 @@ from hil.truth_log import TRUTH_LOG
 BELIEVED, TRUE = "/firmware/body", "/plant/body"
 """Prefixes of the body channels, before the leader's number: as the firmware believes, and as they really are."""
 DOCKED, JAMMED, UNSTABLE, REFUSED, GAVE_UP = range(len(OUTCOMES))
-DECLARED = STAGES.index("docked")
-"""Stage of a dock in the tick in which the firmware declares two bodies joined."""
+DECLARED, FAILED = STAGES.index("docked"), STAGES.index("failed")
+"""Stages of a dock in the ticks in which the firmware declares two bodies joined, or gives it up."""
 FACING = math.cos(math.radians(30.0))
 """Least cosine between the normals of mated faces and the line from centre to centre: 30 deg, a third of a quarter turn."""
 AS_TURNED = 0.1
@@ -45,10 +45,10 @@ def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
     """Docking metrics of a run with [[step]]s.
 
     Returns:
-        docked: whether modules joined and parted as the steps ask; gap_min_m: smallest distance between opposite faces, NaN if none came
-        near; tries: contacts of a probe with a funnel; jams: jammed contacts; outcome: index into OUTCOMES; false_declarations: joins
-        declared by the firmware that did not happen; join_jump_n: largest step of a thruster's commanded force in a tick in which bodies
-        were joined, N; docked_rmse_m: position RMSE of all joined bodies against their set-points.
+        docked: whether modules joined and parted as the steps ask, and the firmware gave no dock up; gap_min_m: smallest distance between
+        opposite faces, NaN if none came near; tries: contacts of a probe with a funnel; jams: jammed contacts; outcome: index into
+        OUTCOMES; false_declarations: joins declared by the firmware that did not happen; join_jump_n: largest step of a thruster's
+        commanded force in a tick in which bodies were joined, N; docked_rmse_m: RMSE of all joined bodies against their set-points.
 
     Raises:
         OSError: a log is missing. ValueError: the truth log has no docks.
@@ -57,7 +57,7 @@ def docking_metrics(scenario: Scenario, folder: Path) -> dict[str, float]:
     docks = truths.get("/plant/docks")
     if docks is None:
         raise ValueError(f"{folder}: no truth of docks in the logs")
-    docked = is_as_asked(scenario, truths)
+    docked = is_as_asked(scenario, truths) and not _is_given_up(signals)
     outcome = DOCKED if docked else _failure(docks, signals)
     return {
         "docked": float(docked),
@@ -160,6 +160,12 @@ def _false_declarations(truths: Mapping[str, Columns], signals: Mapping[str, Col
     at = np.searchsorted(ticks, docks["tick"][declared])
     true = _together(truths, ticks)[at, docks["module_a"][declared], docks["module_b"][declared]]
     return max(too_few, int((~true).sum()))
+
+
+def _is_given_up(signals: Mapping[str, Columns]) -> bool:
+    """Whether the firmware gave a dock up: hulls that it then let go have joined and parted without a dock and an undock."""
+    docks = signals.get("/firmware/docks")
+    return docks is not None and bool((docks["stage"] == FAILED).any())
 
 
 def _failure(docks: Columns, signals: Mapping[str, Columns]) -> int:

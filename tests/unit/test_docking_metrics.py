@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from firmware_py.description.signals import Columns
-from hil.docking_metrics import DECLARED, _docked_rmse_m, _false_declarations, _join_jump_n, docking_metrics, is_as_asked, is_obeyed
+from hil.docking_metrics import DECLARED, FAILED, _docked_rmse_m, _false_declarations, _join_jump_n, docking_metrics, is_as_asked, is_obeyed
+from hil.metrics import OUTCOMES
 from hil.scenario import Scenario, Step, load_scenario
 from hil.signals import SIGNAL_LOG
 from hil.truth_log import TRUTH_LOG
@@ -105,6 +106,22 @@ def test_faces_that_came_nearest_are_told_of_and_none_where_none_came_near(tmp_p
         logs = {TRUTH_LOG: truths, SIGNAL_LOG: {"/events": events}}
         monkeypatch.setattr("hil.docking_metrics.read_signals", lambda path, logs=logs: logs[path.name])
         assert docking_metrics(asked(Step(do="wait")), tmp_path)["gap_min_m"] == pytest.approx(nearest_m, nan_ok=True)
+
+
+@pytest.mark.parametrize(("stage", "docked", "outcome"), [(DECLARED, 1.0, "as asked"), (FAILED, 0.0, "gave up")])
+def test_dock_that_the_firmware_gave_up_is_none_though_hulls_joined_and_parted(
+    stage: int, docked: float, outcome: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: magnets that held, and pushed off after a supposed jam, counted as a dock and an undock."""
+    truths = truth_of([APART, PAIR, APART], PLACES)
+    for module in range(3):
+        truths[f"/plant/module{module}"]["force_n"] = np.zeros((100, 8))
+    truths["/plant/docks"] |= {"gap_m": np.zeros(100), "contacts": np.ones(100), "jams": np.zeros(100)}
+    docks = {"tick": TICKS[50:51], "module_a": np.array([0]), "module_b": np.array([1]), "stage": np.array([stage])}
+    logs = {TRUTH_LOG: truths, SIGNAL_LOG: {"/events": {"text": np.zeros(0, str)}, "/firmware/docks": docks}}
+    monkeypatch.setattr("hil.docking_metrics.read_signals", lambda path: logs[path.name])
+    found = docking_metrics(asked(DOCK, Step(do="undock", module=2, target_module=1)), tmp_path)
+    assert found["docked"] == docked and OUTCOMES[int(found["outcome"])] == outcome
 
 
 def test_without_a_dock_nothing_may_join_or_part() -> None:
