@@ -45,6 +45,10 @@ if TYPE_CHECKING:
     from firmware_py.app.ground_station import GroundSide
 
 FORGETFUL = "warning: --hold without --out: an e-stop in this run will not be known at the next start"
+PITCH = (
+    "warning: pitch_m of the fleet is {:g} m, but hulls measure {} m between their docking faces: modules dock one pitch_m apart, "
+    "and give up as jams what is nearer or farther"
+)
 UNTAGGED = "warning: module {} carries no [[tag]]: no camera places it, so --hold never arms it; a pilot has attitude and depth alone"
 UNUSABLE_FOLDER_ERRORS = (FileExistsError, NotADirectoryError, PermissionError)
 """Errors of a log folder that is not a folder or not writable for us; these refuse the start. After other disk errors it flies unlogged."""
@@ -89,6 +93,7 @@ def run_vehicle(
         if hold and out is None:
             teller.say(FORGETFUL)
         _warn_of_untagged(firmware, teller.say)
+        _warn_of_pitch(firmware, teller.say)
         stack.enter_context(handled(operator.stop, endings_of_a_run()))  # until the log and the e-stop note are closed
         logs = _open_logs(stack, firmware, before, boot, out, live, teller.say)
         side = _open_ground(stack, ground, firmware, parameters) if ground is not None else None
@@ -116,6 +121,15 @@ def _warn_of_untagged(firmware: Firmware, say: Callable[[str], None]) -> None:
     for body in firmware.pipeline.bodies:
         if not body.tag_ids.size:
             say(UNTAGGED.format(" and ".join(map(firmware.fleet.label, body.modules))))
+
+
+def _warn_of_pitch(firmware: Firmware, say: Callable[[str], None]) -> None:
+    """Hulls of docked modules touch, unless something sticks out of them."""
+    pitch_m, tolerance_m = firmware.fleet.pitch_m, firmware.parameters.docking.position_tolerance_m
+    dockers = [vehicle.docking_edges_m for vehicle in firmware.vehicles if vehicle.docking_edges_m]
+    odd = sorted(edge for edge in set[float]().union(*dockers) if abs(edge - pitch_m) > tolerance_m)
+    if len(dockers) > 1 and odd:
+        say(PITCH.format(pitch_m, " and ".join(f"{edge:g}" for edge in odd)))
 
 
 def _open_logs(

@@ -20,7 +20,7 @@ from firmware_py.app.vehicle_process import run_vehicle
 from firmware_py.bus.codec import Frame
 from firmware_py.bus.port.links import VirtualLink
 from firmware_py.core.types import Event, Inputs, ModuleCommand, Outputs
-from firmware_py.description.fleet import single
+from firmware_py.description.fleet import Fleet, Module, single
 from firmware_py.description.parameters import Parameters
 from firmware_py.runtime import teller
 from firmware_py.runtime.flight_log import FlightLog
@@ -90,6 +90,15 @@ def test_robot_that_carries_no_tag_is_told_so_at_its_start(name: str, told: int,
     """No camera can see it, so it would wait for its pose forever."""
     said = fly(tmp_path, fleet=single(name, bus_of(tmp_path)), hold=True)
     assert sum(line.startswith("warning: module 1 carries no [[tag]]: ") for line in said) == told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("modules", "pitch_m", "told"), [(2, 0.2, 1), (2, 0.21, 0), (1, 0.2, 0)])
+def test_fleet_whose_pitch_is_not_its_hulls_is_told_so_at_its_start(modules: int, pitch_m: float, told: int, tmp_path: Path) -> None:
+    """Its modules would touch and be given up as jams."""
+    cubes = tuple(Module(number=n + 1) for n in range(modules))
+    said = fly(tmp_path, fleet=Fleet(module=cubes, buses=(bus_of(tmp_path),), pitch_m=pitch_m))
+    assert sum(line.startswith("warning: pitch_m of the fleet is 0.2 m, but hulls measure 0.21 m") for line in said) == told
 
 
 @pytest.mark.slow
