@@ -112,7 +112,7 @@ TABLE = (
     Row("module_silent", "a module is silent", "silent_s", LASTS, who=least("hears_ns")),
     Row("module_late", "a module answers too late, or for another tick", "any_late", who=lambda health: name_modules(health.late)),
     Row("estop_box_silent", "e-stop box silent", "estop_box_age_s", LASTS),
-    Row("ticks_missed", "ticks missed", "missed_ticks_per_s", ": {:.0f} in a second"),
+    Row("ticks_missed", "ticks missed", "missed_percent", ": {:.0f}% of them"),
     Row("fence", "outside the fence", "outside_m", " by {:.2f} m", modes=MOVING, forced_modes=frozenset({Mode.ALT_HOLD})),
     Row("collision", "another body is in the way", "collision_s", ", {:.1f} s to brake", below=True, modes=FREE, warned_modes=UNSTOPPED),
     Row("ground_lost", "ground station silent", "ground_age_s", LASTS, modes=ANY - {Mode.AUTO, Mode.SURFACE}),

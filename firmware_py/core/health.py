@@ -56,7 +56,8 @@ class Health(NamedTuple):
     esc_missing: tuple[Place, ...]
     """Places of thrusters whose ESC does not answer, or reports a fault."""
     frame_errors_per_s: float
-    missed_ticks_per_s: float
+    missed_percent: float
+    """Share of the ticks that were missed, mean of a second, %."""
     foreign_sync: bool
     foreign_command: bool
     """Whether another node sent SYNC (or commanded modules) in the last second."""

@@ -65,7 +65,7 @@ class _Latest:
     stick: float = 0.0
     dropped_frames: int = 0
     error_rate: float = 0.0
-    missed_rate: float = 0.0
+    missed_percent: float = 0.0
     push_m2_s2: float = 0.0
     off_rad2: float = 0.0
 
@@ -172,7 +172,7 @@ class HealthMonitor:
             bus_silent_s=max(now - max(self._reports.heard_ns.values()), stopped_ns) * 1e-9,
             esc_missing=tuple([self._places[i] for i in _older(self._esc_ns, now - self._esc_fresh_ns)]),
             frame_errors_per_s=latest.error_rate,
-            missed_ticks_per_s=latest.missed_rate,
+            missed_percent=latest.missed_percent,
             foreign_sync=now - latest.foreign_sync_ns <= FOREIGN_NS,
             foreign_command=now - latest.foreign_command_ns <= FOREIGN_NS,
             ground_age_s=_age_s(latest.ground_ns, now),
@@ -287,7 +287,7 @@ class HealthMonitor:
         errors, latest.dropped_frames = inputs.dropped_frames - latest.dropped_frames, inputs.dropped_frames
         latest.error_rate = keep * latest.error_rate + errors / MEAN_S
         missed = max(0, round(dt_s * 1e9 / self._period_ns) - 1)
-        latest.missed_rate = keep * latest.missed_rate + missed / MEAN_S
+        latest.missed_percent = keep * latest.missed_percent + 1e-7 * missed * self._period_ns / MEAN_S
         current_m_s = _current_m_s(*_pushed(estimate), *self._drag)
         if abs(current_m_s) <= MOST_CURRENT_M_S:  # not where it is NaN
             latest.push_m2_s2 += (1.0 - keep) * (current_m_s**2 - latest.push_m2_s2)

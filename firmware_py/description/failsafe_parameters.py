@@ -197,7 +197,7 @@ class Failsafes:
     estop_box_silent_latched: int = latched(0, "FS_EBOX_LAT")
     # the controller is late
     ticks_missed_limit: float = quantity(
-        5.0, unit="1/s", low=1, high=400, help="largest permitted rate of missed ticks", mavlink="FS_TICK_LIM"
+        5.0, unit="%", low=1, high=100, help="largest permitted share of missed ticks, mean over one second", mavlink="FS_TICK_LIM"
     )
     ticks_missed_delay_s: float = delay(0.5, "FS_TICK_S")
     ticks_missed_action: int = action(2, "FS_TICK_ACT")

@@ -20,7 +20,7 @@ FIELDS: dict[str, str] = {
     "tag_gone": "tag_age_s", "partner_lost": "open_joints", "estimator": "nis_ratio", "rejected": "rejected_share",
     "tag_lost": "tag_age_s", "pushed": "push_m_s", "tag_late": "tag_age_s",
     "depth_lost": "depth_age_s", "imu_lost": "imu_age_s", "sensor_lost": "sensor_age_s", "module_silent": "silent_s", "module_late": "late",
-    "estop_box_silent": "estop_box_age_s", "ticks_missed": "missed_ticks_per_s", "fence": "outside_m", "collision": "collision_s",
+    "estop_box_silent": "estop_box_age_s", "ticks_missed": "missed_percent", "fence": "outside_m", "collision": "collision_s",
     "ground_lost": "ground_age_s", "pilot_lost": "pilot_age_s",
     "thruster_lost": "dead", "cabin_unknown": "cabin_age_s", "battery_unknown": "battery_age_s", "battery_low": "voltage_share",
 }  # fmt: skip
@@ -53,7 +53,7 @@ WORDS = {
     "module_silent": "a module is silent for 0.5 s",
     "module_late": "a module answers too late, or for another tick",
     "estop_box_silent": "e-stop box silent for 5.0 s",
-    "ticks_missed": "ticks missed: 5 in a second",
+    "ticks_missed": "ticks missed: 5% of them",
     "fence": "outside the fence by 0.05 m",
     "collision": "another body is in the way, 0.2 s to brake",
     "ground_lost": "ground station silent for 5.0 s",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from firmware_py.core.body import Body
-from firmware_py.core.failsafes import TABLE, Watch
+from firmware_py.core.failsafes import TABLE, Failsafes, Watch
 from firmware_py.core.faults import ThrusterFaults
 from firmware_py.core.fence import outside
 from firmware_py.core.health import NEVER_S, Health
@@ -27,6 +27,7 @@ from firmware_py.core.types import (
     Estimate,
     Inputs,
     Measured,
+    Mode,
     ModuleInputs,
     Request,
     Sticks,
@@ -291,10 +292,10 @@ def test_joined_body_knows_of_the_ticks_that_were_missed_before() -> None:
     bench, both = MonitorBench(), MonitorBench()
     bench.step()
     bench.time_ns += 20 * TICK_NS
-    missed = bench.step().missed_ticks_per_s
+    missed = bench.step().missed_percent
     both.monitor.take_over([bench.monitor, MonitorBench().monitor])
     both.time_ns = bench.time_ns
-    assert both.step().missed_ticks_per_s == pytest.approx(missed, rel=0.02) == pytest.approx(20.0, rel=0.02)
+    assert both.step().missed_percent == pytest.approx(missed, rel=0.02) == pytest.approx(20.0, rel=0.02)
 
 
 def test_fence_and_delays_may_change() -> None:
@@ -370,11 +371,26 @@ def test_bad_frames_and_missed_ticks_are_rates() -> None:
     for _ in range(300):
         bench.dropped += 1
         health = bench.step()
-    assert health.frame_errors_per_s == pytest.approx(100.0, rel=0.06) and health.missed_ticks_per_s == 0.0
+    assert health.frame_errors_per_s == pytest.approx(100.0, rel=0.06) and health.missed_percent == 0.0
     for _ in range(100):
         bench.time_ns += TICK_NS
         health = bench.step()
-    assert health.missed_ticks_per_s == pytest.approx(50.0, rel=0.2)
+    assert health.missed_percent == pytest.approx(50.0, rel=0.2)
+
+
+@pytest.mark.parametrize("rate_hz", [50, 100, 200, 400])
+def test_pause_of_the_process_counts_as_much_at_every_tick_rate(rate_hz: int) -> None:
+    """Regression: missed ticks were counted, so that one pause of 25 ms made a robot hold at 400 Hz, and at 50 Hz one of 180 ms did not."""
+    period_ns, faults = 1_000_000_000 // rate_hz, ThrusterFaults(np.ones(16, dtype=bool), (), 0, np.eye(6), np.ones(2))
+    monitor, failsafes = HealthMonitor(BODY, Parameters(), period_ns), Failsafes(Parameters().failsafes)
+    monitor.believed = modules = [ModuleInputs(answered=True, heard=True)] * 4
+    held_ms, time_ns = list[int](), START_NS
+    for pause_ms in (40, 80, 120):
+        for tick in range(6 * rate_hz):
+            time_ns += period_ns + (pause_ms * 1_000_000 if tick == 0 else 0)
+            failsafes.step(monitor.step(Inputs(tick, time_ns, modules), ESTIMATE, [], faults), Mode.POSHOLD, forced=False, armed=True)
+            held_ms += [pause_ms] if failsafes.is_on("ticks_missed") and pause_ms not in held_ms else []
+    assert held_ms == [120]
 
 
 def test_time_without_a_tick_is_silence_of_the_bus_in_the_tick_after_it() -> None:
