@@ -25,6 +25,9 @@ CENTRED_M = 1e-9
 """Distance of the mean IMU position from the centre of mass below which the IMUs count as centred: the rest is rounding."""
 ALPHA_S = 0.03
 """Averaging time of the gyro's differences: at 0.3 m of lever their noise makes 0.02 m/s^2; without averaging 0.1 at 100 Hz."""
+GAP_NS = 10_000_000
+"""Longest time between two gyro readings, or a tick if that is longer, over which their difference tells the angular acceleration: an IMU
+may be slower than the tick."""
 GYRO_BIASES, ACCEL_BIASES, DEPTH_BIASES = 0.1, 1.0, 0.5
 """Largest plausible deviation of a sensor from the mean of all, rad/s, m/s^2, m: twenty sigmas and more of the bench's draw of biases. A
 failed sensor reads zeros or its limit, off by gravity, until it is found."""
@@ -48,9 +51,9 @@ class Measurements:
         self._mean_of_all = self._rotations.reshape(3, -1) / len(body.modules)
         self._r_bi, self._mean_r_bi = body.r_bi, body.r_bi.mean(axis=0)
         self._centred = bool(np.abs(self._mean_r_bi).max() < CENTRED_M)
-        per_s = 1e9 / period_ns
-        self._alpha_share = 1.0 - math.exp(-period_ns * 1e-9 / ALPHA_S)
-        self._alpha_gain = self._alpha_share * per_s
+        self._most_gap, self._per_s = max(1, GAP_NS // period_ns), 1e9 / period_ns
+        self._alpha_shares = [1.0 - math.exp(-ticks * period_ns * 1e-9 / ALPHA_S) for ticks in range(self._most_gap + 1)]
+        """Weight of a new difference, by the ticks that it is over."""
         count = len(body.modules)
         self._deviation_matrix = np.kron(np.ones((count, 1)), -self._mean_of_all)
         """(3 count, 3 count) matrix from the readings of all modules to the difference of each from their mean, body frame."""
@@ -63,10 +66,14 @@ class Measurements:
         self._depths_m, self._depth_age = np.zeros(count), np.full(count, self._pressure_silent_ticks)
         """Last depth of each sensor, and ticks with any depth reading since then."""
         self._no_swing = np.zeros(3 * count)
-        self._accel_from_rate_change = per_s * -np.vstack([skew(r) for r in self._r_bi - self._mean_r_bi])
+        self._accel_from_rate_change = self._per_s * -np.vstack([skew(r) for r in self._r_bi - self._mean_r_bi])
         """(3 count, 3) matrix from the rate change within a tick to the resulting difference of each accelerometer from their mean."""
         self._is_still = False
-        """Whether the body, of several modules, turned so slowly in the last tick that differences of its sensors tell their offsets."""
+        """Whether the body, of several modules, turned so slowly at the last gyro reading that differences of its sensors tell their
+        offsets.
+        """
+        self._gap = 0
+        """Ticks since the last gyro reading."""
         self._last_gyro: np.ndarray | None = None
         self._alpha = np.zeros(3)
         """(3,) smoothed angular acceleration, body frame, rad/s^2. Kept up only where the IMUs heard may be off the centre of mass."""
@@ -82,9 +89,15 @@ class Measurements:
             q_wb: (4,) latest attitude, for the height of each pressure sensor above the centre of mass, and to break ties between tags.
         """
         mine = [modules[i] for i in self._modules]
+        self._gap += 1
         gyro = self._mean([m.gyro for m in mine], self._gyro_offsets, self._no_swing if self._is_still else None)
-        self._is_still = len(mine) > 1 and gyro is not None and float(gyro @ gyro) < STILL_RAD_S**2
-        return Measured(gyro, self._accel([m.accel for m in mine], gyro), self._depth(mine, q_wb), self._poses(mine, q_wb))
+        if gyro is not None:
+            self._is_still = len(mine) > 1 and float(gyro @ gyro) < STILL_RAD_S**2
+        elif self._gap >= self._most_gap:
+            self._is_still = False
+        accel = self._accel([m.accel for m in mine], gyro)
+        self._gap = self._gap if gyro is None else 0
+        return Measured(gyro, accel, self._depth(mine, q_wb), self._poses(mine, q_wb))
 
     def _mean(self, readings: list[np.ndarray | None], offsets: SensorOffsets, swing: np.ndarray | None) -> np.ndarray | None:
         """Returns the mean over all modules, (3,) in the body frame. Corrects it by the learnt offsets where some modules were not heard.
@@ -120,19 +133,22 @@ class Measurements:
         """Returns (3 count,) difference of each accelerometer from their mean due to angular acceleration, m/s^2. None unless the body is
         nearly still, because otherwise its angular rate matters too.
 
-        Computed from the gyro's change in the last tick, unsmoothed: its noise is large, but averages out over the many ticks over which
+        Computed from the gyro's last change, unsmoothed: its noise is large, but averages out over the many ticks over which
         offsets are learnt, and it has no lag.
         """
         if not self._is_still or gyro is None or self._last_gyro is None:
             return None
-        return np.asarray(self._accel_from_rate_change @ (gyro - self._last_gyro))
+        return np.asarray(self._accel_from_rate_change @ (gyro - self._last_gyro)) / self._gap
 
     def _update_alpha(self, gyro: np.ndarray | None) -> None:
-        """Updates the angular acceleration, rad/s^2: the smoothed change of the gyro from tick to tick; zero after a tick without gyro."""
+        """Updates the angular acceleration, rad/s^2: smoothed, from one gyro reading to the next; zero after `GAP_NS` without one."""
+        if gyro is None and self._gap < self._most_gap:
+            return
         if gyro is None or self._last_gyro is None:
             self._alpha = np.zeros(3)
         else:
-            self._alpha = self._alpha + self._alpha_gain * (gyro - self._last_gyro) - self._alpha_share * self._alpha
+            share = self._alpha_shares[self._gap]
+            self._alpha = self._alpha + share * self._per_s / self._gap * (gyro - self._last_gyro) - share * self._alpha
         self._last_gyro = gyro
 
     def _lever(self, heard: list[bool]) -> np.ndarray:

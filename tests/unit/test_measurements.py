@@ -356,6 +356,25 @@ def test_body_that_swings_at_once_takes_no_angular_acceleration_for_a_bias(body:
     np.testing.assert_allclose(measured.accel, PUSHED, atol=1e-3)
 
 
+@pytest.mark.parametrize(("period_ns", "imu_every"), [(PERIOD, 1), (PERIOD // 2, 2), (PERIOD // 4, 4)])
+def test_imus_that_are_slower_than_the_tick_are_told_apart_and_feel_the_turn(body: Body, period_ns: int, imu_every: int) -> None:
+    """Regression: at 200 Hz with IMUs of 100 Hz nothing was learnt of how they differ, so that a pair that lost one swam off by 20 mm."""
+    measurements = Measurements(body, period_ns)
+    for tick in range(400):
+        if tick % imu_every:
+            measurements.fuse(silent(), Q_WB)
+        else:
+            biased(measurements, (0, 1, 2), np.zeros(3))
+    told = biased(measurements, (1,), np.zeros(3))
+    np.testing.assert_allclose(told[:6], BIASES[:, :6].mean(axis=0), atol=1e-3)
+    measurements = Measurements(body, period_ns)
+    for tick in range(100 * imu_every + 1):
+        heard = () if tick % imu_every else (0,)
+        measured = turning(measurements, heard, RATE + ALPHA * tick * period_ns * 1e-9, ALPHA)
+    assert measured.accel is not None
+    np.testing.assert_allclose(measured.accel, PUSHED, atol=1e-3)
+
+
 def test_depth_is_told_by_the_density_that_drags() -> None:
     cube = load_vehicle("modcube")
     lone = assemble([(0, 0, 0)], [0], [cube], [0])
