@@ -41,7 +41,7 @@ class Firmware:
     def sync(self, tick: int, time_ns: int) -> list[BusFrame]:
         """The SYNC frames that start tick `tick` on each bus."""
         self.collector.sync_sent(tick, time_ns)
-        return self.encoder.sync(tick)
+        return self._sent(self.encoder.sync(tick))
 
     def discard_received(self) -> None:
         """Discards what was collected, so that the first tick takes only frames after its SYNC, as the log records it."""
@@ -59,7 +59,11 @@ class Firmware:
 
     def frames(self, outputs: Outputs) -> list[BusFrame]:
         """The frames to send in a tick. A module's thrusters are commanded only after its first MCU_STATUS."""
-        return self.encoder.frames(outputs, self.collector.without_status)
+        return self._sent(self.encoder.frames(outputs, self.collector.without_status))
+
+    def _sent(self, frames: list[BusFrame]) -> list[BusFrame]:
+        self.collector.sent(frames)
+        return frames
 
     def tick(self, inputs: Inputs) -> Outputs:
         """Steps the fleet. Finished results of the worker enter `inputs`; new preparation requests go to the worker."""

@@ -1,6 +1,6 @@
 """Load of a bus, from the DBC alone: worst-case bits and rate of every frame, and the fullest tick.
 
-Used by `tools/bus_load.py` and `modcube doctor`; nothing here runs in a tick.
+Used by `tools/bus_load.py` and `modcube doctor`; `mapping` counts the frames of a flight by `bits_of`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from firmware_py.bus.codec import Codec, MessageCodec
+from firmware_py.bus.codec import Codec, Frame, MessageCodec
 
 BIT_RATE = 1_000_000
 """bit/s of every bus."""
@@ -51,6 +51,11 @@ class BusLoad(NamedTuple):
 def frame_bits(length: int) -> int:
     """Returns the worst-case bits of a frame of `length` bytes on the wire, including the interframe space."""
     return FRAME_BITS + BYTE_BITS * length
+
+
+def bits_of(frames: Sequence[Frame]) -> int:
+    """Returns the same for all of these frames together."""
+    return FRAME_BITS * len(frames) + BYTE_BITS * sum([len(data) for _, data in frames])
 
 
 def slow_schedule(codec: Codec, number: int, rate_hz: int) -> list[tuple[MessageCodec, int, int]]:

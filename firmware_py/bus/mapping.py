@@ -5,12 +5,15 @@ Sits at both ends of a tick, between the ports and the pipeline. Has no clock: t
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Sequence
+from operator import truediv
 
 import numpy as np
 
 from firmware_py.bus.codec import Codec, Frame, Receiver, unpack_quaternion
 from firmware_py.bus.codec.receiver import COUNTER, MESSAGE, NUMBER, VALUES
+from firmware_py.bus.load import BIT_RATE, bits_of, frame_bits
 from firmware_py.core.types import CHANNELS, MCU_ESTOP, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.fleet import Fleet
 
@@ -31,6 +34,8 @@ SENSOR_FAULT = 15
 FOREIGN = frozenset(("ESTOP", "SYNC", "DOCK_CMD", "THRUSTER_CMD_A", "THRUSTER_CMD_B", "HEARTBEAT"))
 """Messages that no module sends; what another node says with them, `InputCollector` takes without a handler."""
 THRUSTERS_OF_A_FRAME = 4
+WITHOUT_BIT_RATE = ("virtual:", "udp:")
+"""Kinds of buses that take as many frames as one sends."""
 ESTOP_PERIOD_NS = 50_000_000
 """ESTOP goes out at 20 Hz while it is raised."""
 
@@ -50,6 +55,8 @@ class InputCollector:
 
     def __init__(self, fleet: Fleet, codec: Codec) -> None:
         self._receivers = [Receiver(codec) for _ in fleet.buses]
+        self._bits = [0] * len(fleet.buses)
+        self._bit_rates = [math.inf if address.startswith(WITHOUT_BIT_RATE) else float(BIT_RATE) for address in fleet.buses]
         self._index = {(module.bus, module.number): index for index, module in enumerate(fleet.module)}
         self._modules = [ModuleInputs() for _ in fleet.module]
         self._status_ticks: list[int | None] = [None] * len(fleet.module)
@@ -82,10 +89,16 @@ class InputCollector:
         """Records that SYNC `tick` went out at `time_ns`, from which the capture times of tags count."""
         self._sync_ns[tick % REMEMBERED_TICKS] = time_ns
 
+    def sent(self, frames: Sequence[tuple[int, Frame]]) -> None:
+        """Counts frames that go out, each with the index of its bus, among those that occupy it."""
+        for bus, frame in frames:
+            self._bits[bus] += frame_bits(len(frame.data))
+
     def take(self, bus: int, frames: Sequence[Frame]) -> None:
         """Takes the frames received on bus `bus`, whatever their contents."""
         if not frames:
             return
+        self._bits[bus] += bits_of(frames)
         for row in self._receivers[bus].rows(frames).tolist():
             which = int(row[MESSAGE])
             if which < 0:
@@ -123,7 +136,11 @@ class InputCollector:
         foreign_command, self._foreign_command = self._foreign_command, False
         estop_box, self._estop_box = self._estop_box, False
         dropped = sum([receiver.dropped_in_all for receiver in self._receivers])
-        return Inputs(tick, time_ns, modules, list(requests), estop, dropped, foreign_sync, foreign_command, estop_box)
+        busy_s = max(map(truediv, self._bits, self._bit_rates))
+        self._bits = [0] * len(self._bits)
+        return Inputs(
+            tick, time_ns, modules, list(requests), estop, dropped, foreign_sync, foreign_command, estop_box, busy_s=busy_s
+        )  # fmt: skip
 
     def _make_handlers(self) -> dict[str, Callable[[int, ModuleInputs, Row], None]]:
         handlers: dict[str, Callable[[int, ModuleInputs, Row], None]] = {

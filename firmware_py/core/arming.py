@@ -128,6 +128,11 @@ def _frames(q: Question) -> str:
     return f"{rate:.0f} bad frames a second, {permitted:.0f} permitted" if rate > permitted else ""
 
 
+def _load(q: Question) -> str:
+    permitted, load = q.parameters.supervision.bus_load, q.health.bus_load
+    return f"bus is {load:.0%} full, {permitted:.0%} permitted" if load > permitted else ""
+
+
 def _parameters(q: Question) -> list[str]:
     return invalid(q.parameters) + contradictions(q.parameters)
 
@@ -158,6 +163,7 @@ CHECKS = (
     Check("every axis has thrust", _thrusters, True),
     Check("no fail-safe on", _failsafes, True),
     Check("few bad frames", _frames, True),
+    Check("bus not full", _load, True),
     Check("topology as configured", _joints, True),
 )
 

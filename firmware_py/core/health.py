@@ -56,6 +56,8 @@ class Health(NamedTuple):
     esc_missing: tuple[Place, ...]
     """Places of thrusters whose ESC does not answer, or reports a fault."""
     frame_errors_per_s: float
+    bus_load: float
+    """Share of the fullest bus in use, mean of a second."""
     missed_percent: float
     """Share of the ticks that were missed, mean of a second, %."""
     foreign_sync: bool

@@ -65,6 +65,7 @@ class _Latest:
     stick: float = 0.0
     dropped_frames: int = 0
     error_rate: float = 0.0
+    bus_load: float = 0.0
     missed_percent: float = 0.0
     push_m2_s2: float = 0.0
     off_rad2: float = 0.0
@@ -172,6 +173,7 @@ class HealthMonitor:
             bus_silent_s=max(now - max(self._reports.heard_ns.values()), stopped_ns) * 1e-9,
             esc_missing=tuple([self._places[i] for i in _older(self._esc_ns, now - self._esc_fresh_ns)]),
             frame_errors_per_s=latest.error_rate,
+            bus_load=latest.bus_load,
             missed_percent=latest.missed_percent,
             foreign_sync=now - latest.foreign_sync_ns <= FOREIGN_NS,
             foreign_command=now - latest.foreign_command_ns <= FOREIGN_NS,
@@ -282,10 +284,11 @@ class HealthMonitor:
                 self._latest.stick = max(abs(value) for group in request.argument for value in group)
 
     def _rates(self, inputs: Inputs, estimate: Estimate, dt_s: float) -> None:
-        """Updates the one-second means: bad frames, missed ticks, and the push as an equivalent current."""
+        """Updates the one-second means: bad frames, bus load, missed ticks, and the push as an equivalent current."""
         latest, keep = self._latest, math.exp(-dt_s / MEAN_S)
         errors, latest.dropped_frames = inputs.dropped_frames - latest.dropped_frames, inputs.dropped_frames
         latest.error_rate = keep * latest.error_rate + errors / MEAN_S
+        latest.bus_load = keep * latest.bus_load + inputs.busy_s / MEAN_S
         missed = max(0, round(dt_s * 1e9 / self._period_ns) - 1)
         latest.missed_percent = keep * latest.missed_percent + 1e-7 * missed * self._period_ns / MEAN_S
         current_m_s = _current_m_s(*_pushed(estimate), *self._drag)

@@ -209,6 +209,8 @@ class Inputs:
     """A HEARTBEAT of an e-stop box that works came since the previous tick."""
     prepared: list[Any] = field(default_factory=list)
     """Results of the worker: docking_decisions.Prepared."""
+    busy_s: float = 0.0
+    """Time for which frames occupied the fullest bus since the previous tick, s, with the most stuff bits."""
 
 
 # ---------------------------------------------------------------- between the stages

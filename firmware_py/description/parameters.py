@@ -199,6 +199,10 @@ class Supervision:
     frame_errors_per_s: float = quantity(
         20.0, unit="1/s", low=0, high=10000, help="largest rate of bad frames to arm with", mavlink="ARM_FRAME_ERR"
     )
+    bus_load: float = quantity(
+        0.8, low=0.05, high=2, help="largest share of a bus in use to arm with, mean over one second, with the most stuff bits",
+        mavlink="ARM_BUS_LOAD",
+    )
     estop_quiet_ms: float = quantity(
         200.0,
         unit="ms",

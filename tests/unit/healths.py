@@ -24,6 +24,7 @@ GOOD = Health(
     bus_silent_s=0.0,
     esc_missing=(),
     frame_errors_per_s=0.0,
+    bus_load=0.2,
     missed_percent=0.0,
     foreign_sync=False,
     foreign_command=False,

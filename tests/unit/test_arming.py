@@ -66,6 +66,7 @@ SOFT: list[tuple[Health, str]] = [
     (GOOD._replace(lost_axes=1), "the thrusters left cannot make every wrench"),
     (GOOD._replace(without_thrust=("pitch",)), "pitch has no thrust: declare it in passive_dof of the vehicle file, or add thrusters"),
     (GOOD._replace(frame_errors_per_s=21.0), "21 bad frames a second, 20 permitted"),
+    (GOOD._replace(bus_load=0.93), "bus is 93% full, 80% permitted"),
     (GOOD._replace(open_joints=(DockRequest(2, 0, 1, 1),)), "modules 1 and 2 do not hold together"),
     (GOOD._replace(open_joints=(DockRequest(2, 0, 1, 1),) * 3), "modules 1 and 2 do not hold together, and 2 more pairs"),
 ]
@@ -161,14 +162,15 @@ def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
     assert [check.name for check in CHECKS if check.may_be_skipped] == [
         "e-stop box heard", "pose fresh", "pose sure", "pose consistent", "battery and cabin known",
         "modules fit", "every ESC answers", "no ESC without a thruster", "every axis has thrust", "no fail-safe on",
-        "few bad frames", "topology as configured",
+        "few bad frames", "bus not full", "topology as configured",
     ]  # fmt: skip
     both = GOOD._replace(silent=(2,), tag_age_s=0.7)
     assert reasons(both) == ["module 2 does not answer", "pose is 700 ms old, 500 permitted"]
 
 
 BOUNDARIES = [
-    ("tag_age_s", 0.5), ("sigma_m", 0.05), ("nis_ratio", 5.0), ("rejected_share", 0.8), ("frame_errors_per_s", 20.0), ("cabin_age_s", 2.0),
+    ("tag_age_s", 0.5), ("sigma_m", 0.05), ("nis_ratio", 5.0), ("rejected_share", 0.8), ("frame_errors_per_s", 20.0), ("bus_load", 0.8),
+    ("cabin_age_s", 2.0),
 ]  # fmt: skip
 
 

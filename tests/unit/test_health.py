@@ -61,6 +61,7 @@ class MonitorBench:
         self.tick = 0
         self.time_ns = START_NS
         self.dropped = 0
+        self.busy_s = 0.0
         self.foreign: dict[str, bool] = {}
 
     def step(self, one: ModuleInputs | None = None, three: ModuleInputs | None = None, *requests: Request, **more: Any) -> Health:
@@ -70,7 +71,7 @@ class MonitorBench:
         modules = [other, one or ModuleInputs(), other, three or ModuleInputs()]
         estimate = ESTIMATE._replace(**{k: v for k, v in more.items() if k in Estimate._fields})  # type: ignore[arg-type]
         self.monitor.believed = modules
-        inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped, **self.foreign)
+        inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped, busy_s=self.busy_s, **self.foreign)
         faults = ThrusterFaults(np.ones(self.count, dtype=bool), (), 0, np.eye(6), np.ones(2))
         return self.monitor.step(inputs, estimate, list(requests), faults)
 
@@ -364,6 +365,13 @@ def test_e_stop_box_counts_once_it_was_heard_by_any_part_of_the_body() -> None:
     assert later.step().estop_box_age_s == pytest.approx(0.51)
     bench.foreign = {"estop_box": True}
     assert bench.step().estop_box_age_s == 0.0, "whenever it speaks"
+
+
+def test_bus_load_is_the_share_of_a_second() -> None:
+    bench = MonitorBench()
+    bench.busy_s = 0.6 * 1e-9 * TICK_NS
+    assert bench.wait(1.0).bus_load == pytest.approx(0.6 * (1.0 - math.exp(-1.0)), rel=0.02)
+    assert bench.wait(9.0).bus_load == pytest.approx(0.6, rel=0.01)
 
 
 def test_bad_frames_and_missed_ticks_are_rates() -> None:

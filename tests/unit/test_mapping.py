@@ -1,13 +1,17 @@
 """Frames from a module reach its own Inputs in each tick; and the effect of strangers on the bus."""
 
 import copy
+import dataclasses
 
 import pytest
 
+from firmware_py.app.firmware import compose
 from firmware_py.bus.codec import Codec, Frame, load_database
 from firmware_py.bus.mapping import InputCollector
 from firmware_py.core.types import MCU_ESTOP, Action, ModuleInputs, Request
-from tests.unit.bus_robot import CODEC, TWO_BUSES, Robot
+from firmware_py.description.fleet import single
+from firmware_py.description.parameters import Parameters
+from tests.unit.bus_robot import CODEC, TICK_NS, TWO_BUSES, Robot
 
 # ------------------------------------------------------------------ sensors
 
@@ -199,6 +203,30 @@ def test_dropped_frames_of_all_buses_are_counted_from_the_start():
     assert robot.tick(0).dropped_frames == 2
     assert robot.tick(1).dropped_frames == 2
     assert {kind: count for kind, count in robot.collector.dropped.items() if count} == {"counter": 1, "length": 1}
+
+
+@pytest.mark.parametrize(("kind", "counts"), [("socketcan", True), ("slcan", True), ("virtual", False), ("udp", False)])
+def test_fullest_bus_counts_what_it_carried_in_the_tick_if_it_has_a_bit_rate(kind: str, counts: bool) -> None:
+    robot = Robot(dataclasses.replace(TWO_BUSES, buses=(f"{kind}:a", f"{kind}:b")))
+    gyro = CODEC.message("GYRO").encode(1, (0.0, 0.0, 0.0, 0), 3)
+    robot.collector.take(0, [gyro])
+    robot.collector.take(1, [gyro, Frame(0x7FF, b"?")])
+    robot.collector.sent([(1, Frame(0, b"")), (0, gyro)])
+    assert robot.tick(0).busy_s == pytest.approx(1e-6 * (2 * 135 if counts else 0)), "135 bits of eight bytes each, on the first bus"
+    robot.collector.take(1, [gyro, Frame(0x7FF, b"?")])
+    assert robot.tick(1).busy_s == pytest.approx(1e-6 * (135 + 65 if counts else 0)), "an unknown frame takes its time too"
+
+
+def test_frames_that_the_firmware_sends_occupy_the_bus_too():
+    firmware = compose(dataclasses.replace(single(), buses=("socketcan:a",)), Parameters())
+    status = CODEC.message("MCU_STATUS").encode(1, (1, 0, 0, 1), 0)
+    busy_s = []
+    for tick in (1, 2):
+        firmware.sync(tick, tick * TICK_NS)
+        busy_s.append(firmware.step(tick, tick * TICK_NS, [(0, status)], [])[0].busy_s)
+    sync, told = 55 + 10 * len(CODEC.message("SYNC").encode(0, (1,)).data), 55 + 10 * len(status.data)
+    assert busy_s[0] == pytest.approx(1e-6 * (sync + told))
+    assert busy_s[1] > busy_s[0] + 2e-6 * 135, "commands of the eight thrusters went out after the first tick"
 
 
 def test_message_of_a_module_without_a_handler_is_refused_at_the_start():
