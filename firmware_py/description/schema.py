@@ -92,6 +92,14 @@ def frozen_array(values: Any) -> np.ndarray:
     return array
 
 
+def refuse_other_length(name: str, values: np.ndarray, tolerance: float = 0.01) -> None:
+    """Raises DescriptionError unless the values of the key `name` are a unit vector or quaternion, within `tolerance`."""
+    length = float(np.linalg.norm(values))
+    if abs(length - 1.0) > tolerance:
+        right = f"not 1; give {np.round(values / length, 4).tolist()}" if length else "but must have length 1"
+        raise DescriptionError(f"{name} {values.tolist()} has length {length:.4g}, {right}", name)
+
+
 def limits_of(cls: type, name: str) -> Limits:
     """The `Limits` of field `name` of dataclass `cls`."""
     limits = cls.__dataclass_fields__[name].metadata.get("limits", Limits())  # type: ignore[attr-defined]

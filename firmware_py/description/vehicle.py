@@ -26,6 +26,7 @@ from firmware_py.description.schema import (
     quantity,
     read_toml,
     refuse_folder,
+    refuse_other_length,
     repeated,
 )
 from firmware_py.description.water import WATER_DENSITY
@@ -170,8 +171,7 @@ class Thruster:
     )
 
     def __post_init__(self) -> None:
-        if abs(float(np.linalg.norm(self.direction)) - 1.0) > 0.01:
-            raise DescriptionError(f"direction {self.direction.tolist()} has not length 1", "direction")
+        refuse_other_length("direction", self.direction)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -183,8 +183,7 @@ class Tag:
     quaternion: np.ndarray = quantity(low=-1, high=1, shape=(4,), help="attitude quaternion, scalar first, tag frame to module frame")
 
     def __post_init__(self) -> None:
-        if abs(float(np.linalg.norm(self.quaternion)) - 1.0) > 1e-3:
-            raise DescriptionError(f"quaternion {self.quaternion.tolist()} has not length 1", "quaternion")
+        refuse_other_length("quaternion", self.quaternion, 1e-3)
 
     @property
     def outward(self) -> np.ndarray:

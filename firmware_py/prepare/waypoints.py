@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.description.schema import DescriptionError, Source, build, did_you_mean, parse_toml, quantity
+from firmware_py.description.schema import DescriptionError, Source, build, did_you_mean, parse_toml, quantity, refuse_other_length
 from firmware_py.prepare.minimum_snap import Limits, Waypoint, check_bounded, plan
 from firmware_py.prepare.piecewise import Piecewise
 
@@ -22,7 +22,6 @@ _POSITION = ("x_m", "y_m", "z_m")
 _ATTITUDE = ("qw", "qx", "qy", "qz")
 _VELOCITY = ("vx_m_s", "vy_m_s", "vz_m_s")
 _COLUMNS = (*_POSITION, *_ATTITUDE, *_VELOCITY, "stop", "duration_s")
-_UNIT_TOLERANCE = 0.01
 _SHOWN = 60
 """Longest excerpt of wrong input in a message, characters."""
 
@@ -45,8 +44,8 @@ class WaypointTable:
         for name, values, length in (("quaternion", self.quaternion, 4), ("velocity_m_s", self.velocity_m_s, 3)):
             if len(values) not in (0, length):
                 raise DescriptionError(f"{name} needs {length} numbers, not {len(values)}", name)
-        if len(self.quaternion) and abs(float(np.linalg.norm(self.quaternion)) - 1.0) > _UNIT_TOLERANCE:
-            raise DescriptionError(f"quaternion {self.quaternion.tolist()} has not length 1", "quaternion")
+        if len(self.quaternion):
+            refuse_other_length("quaternion", self.quaternion)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

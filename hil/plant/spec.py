@@ -11,7 +11,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from firmware_py.description.schema import DescriptionError, quantity
+from firmware_py.description.schema import DescriptionError, quantity, refuse_other_length
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -176,5 +176,4 @@ class CameraPose:
     half_view_deg: float = quantity(60.0, unit="deg", low=1, high=89, help="half the opening angle of the camera's conical field of view")
 
     def __post_init__(self) -> None:
-        if abs(float(np.linalg.norm(self.axis)) - 1.0) > 0.01:
-            raise DescriptionError(f"axis {self.axis.tolist()} has not length 1")
+        refuse_other_length("axis", self.axis)

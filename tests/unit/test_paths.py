@@ -187,7 +187,7 @@ def test_durations_in_a_spreadsheet_are_those_of_the_pieces() -> None:
         ("a.toml", "duration_s = 1.0\n", r"a.toml:1: waypoint: missing key; it needs tables, each \[\[waypoint\]\]"),
         ("a.csv", "x_m,y_m,z_m\n0,0,0\n", r"two waypoints, not 1"),
         ("a.csv", "x_m,y_m,z_m,duration_s\n0,0,0,\n1,0,0,1\n2,0,0,\n", r"waypoint 2 lacks duration_s"),
-        ("a.csv", "x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,1,1,0,0\n1,0,0,,,,\n", r"a.csv:2.*length 1"),
+        ("a.csv", "x_m,y_m,z_m,qw,qx,qy,qz\n0,0,0,1,1,0,0\n1,0,0,,,,\n", r"a.csv:2.*has length 1.414, not 1; give"),
         ("a.toml", "[[waypoint]]\nposition_m = [0.0, 0.0, 0.0]\nspeed = 1.0\n", r"a.toml:3.*speed"),
         ("a.txt", "", r"ends in .csv or .toml"),
     ],
