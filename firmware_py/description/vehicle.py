@@ -47,6 +47,9 @@ MOST_OVER_HULL = 1.1
 """Largest mass, entrained water included, over that of the water in the hull's box: sea water, and parts that stick out of the box."""
 ON_FACE_M = 0.001
 """Distance from a face of the hull's box within which a tag lies on it."""
+LOOKS_INTO = -0.5
+"""Cosine, to the outward normal of the face that it lies on, below which a tag looks into the hull: by more than 30 deg. One that stands
+upright on a face looks along it, to either side by the rounding of its quaternion."""
 MOST_THRUSTERS = 8
 """Thrusters of one module for which its CAN frames have commands."""
 
@@ -342,7 +345,7 @@ def _check_box(vehicle: Vehicle, source: Source) -> None:
         raise source.error(("inertial", "dry_kg"), what)
     for i, tag in enumerate(vehicle.tag):
         on = np.abs(np.abs(tag.position_m) - half) < ON_FACE_M
-        if on.any() and np.max((tag.outward * np.sign(tag.position_m))[on]) < 0.0:
+        if on.any() and np.max((tag.outward * np.sign(tag.position_m))[on]) < LOOKS_INTO:
             what = "looks into the hull from the face that the tag lies on; its z must point into the hull, away from who sees it"
             raise source.error(("tag", i, "quaternion"), what)
 

@@ -260,6 +260,15 @@ def test_odd_vehicle_is_refused(tmp_path: Path, old: str, new: str, words: str) 
         load_vehicle(str(changed(tmp_path, old, new)))
 
 
+@pytest.mark.parametrize("side", [-1, 1])
+@pytest.mark.parametrize("half", [0.5**0.5, 0.7071, 0.707])
+def test_tag_that_stands_upright_at_the_height_of_a_face_does_not_look_into_the_hull(tmp_path: Path, half: float, side: int) -> None:
+    """Regression: whether it was refused told the last digit of its quaternion."""
+    old = "position_m = [0.105, 0.0, 0.0]\nquaternion = [0.7071067811865476, 0.0, -0.7071067811865476, 0.0]"
+    path = changed(tmp_path, old, f"position_m = [0.02, 0.0, {0.105 * side}]\nquaternion = [{half}, 0.0, {-half}, 0.0]")
+    np.testing.assert_allclose(load_vehicle(str(path)).tag[0].outward, [1.0, 0.0, 0.0], atol=2e-3)
+
+
 @pytest.mark.parametrize("arm_m", [0.0, -0.005])
 def test_rotation_that_buoyancy_does_not_right_is_not_left_to_it(tmp_path: Path, arm_m: float) -> None:
     """A bench flight of such a vehicle capsized in three seconds, 134 deg off."""
