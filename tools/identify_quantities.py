@@ -124,13 +124,13 @@ def fitted_vehicle(fit: Fit, vehicle: Vehicle, curve: ThrusterCurve, logs: str) 
     """The vehicle file with the fitted values. The payload stays as described.
 
     The dry mass stays as weighed. Only the sum of rigid and added mass is observable: it is divided as in the file, with the same factor on
-    the rigid part along all axes. The drag coefficients hold all of the drag, so no linear damping is left. Quantities without a field
-    (trim, individual gains) stay in the report.
+    the rigid part along all axes, up to what the hull can carry. The drag coefficients hold all of the drag, so no linear damping is left.
+    Quantities without a field (trim, individual gains) stay in the report.
     """
     old, body = vehicle.inertial, assemble_vehicle(vehicle)
     whole, own = np.diag(body.mass), np.diag(assemble_vehicle(dataclasses.replace(vehicle, payload=())).mass)
     total, before = np.exp(np.concatenate([fit.value("mass"), fit.value("inertia")])) - (whole - own), own
-    rigid = max(old.dry_kg, min(old.wet_kg * float(np.mean(total[:3] / before[:3])), float(total[:3].min())))
+    rigid = max(old.dry_kg, min(old.wet_kg * float(np.mean(total[:3] / before[:3])), float(total[:3].min()), vehicle.most_wet_kg))
     turn = min(float(np.mean(total[3:] / before[3:])), float(np.min(total[3:] / np.diag(old.inertia))))
     inertia, gain = old.inertia * turn, float(np.mean(fit.value("gain")))
     inertial = dataclasses.replace(

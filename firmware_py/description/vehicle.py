@@ -6,6 +6,7 @@ Positions and directions are in the module frame: FRD, origin at the hull's cent
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -257,6 +258,11 @@ class Vehicle:
         return np.array([t.direction / np.linalg.norm(t.direction) for t in self.thruster])
 
     @property
+    def most_wet_kg(self) -> float:
+        """Largest mass, kg, entrained water included, that the water in the hull's box can carry; infinite for a mesh."""
+        return math.inf if self.hull.mesh else MOST_OVER_HULL * WATER_DENSITY * float(np.prod(self.hull.size_m))
+
+    @property
     def docking_edges_m(self) -> set[float]:
         """Edges of the hull, m, along the axes on which it has docking faces."""
         return {float(edge) for axis, edge in enumerate(self.hull.size_m) if set(self.faces[2 * axis : 2 * axis + 2]) & set("PD")}
@@ -339,8 +345,8 @@ def _check_box(vehicle: Vehicle, source: Source) -> None:
     box = f"the hull, a box of {' x '.join(f'{edge:g}' for edge in vehicle.hull.size_m)} m"
     if np.any(np.abs(com) > half):
         raise source.error(("inertial", "com_m"), f"{com.tolist()} m is outside {box} about [0, 0, 0]")
-    water_kg = WATER_DENSITY * float(np.prod(vehicle.hull.size_m))
-    if wet_kg > MOST_OVER_HULL * water_kg:
+    if wet_kg > vehicle.most_wet_kg * (1.0 + 1e-9):
+        water_kg = vehicle.most_wet_kg / MOST_OVER_HULL
         what = f"{wet_kg:g} kg, entrained water included, cannot float: {box}, displaces {water_kg:.3g} kg of water"
         raise source.error(("inertial", "dry_kg"), what)
     for i, tag in enumerate(vehicle.tag):

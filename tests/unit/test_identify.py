@@ -405,3 +405,13 @@ def test_what_a_vehicle_carries_is_written_once(loads: int) -> None:
     np.testing.assert_allclose(np.diag(assemble_vehicle(found).mass), np.diag(assemble_vehicle(vehicle).mass))
     np.testing.assert_allclose(found.inertial.added, vehicle.inertial.added, atol=1e-12)
     assert found.inertial.righting_arm_m == pytest.approx(vehicle.inertial.righting_arm_m)
+
+
+def test_robot_that_is_found_heavier_than_its_hull_carries_is_written_as_a_vehicle(tmp_path: Path) -> None:
+    """Regression: with 15 % more mass than in the file, as in a world of the bench, the file was refused: it "cannot float"."""
+    vehicle = load_vehicle("modcube")
+    values = model.initial_values(vehicle) | {"mass": np.log(1.15) + model.initial_values(vehicle)["mass"]}
+    found = quantities.fitted_vehicle(SimpleNamespace(value=values.get), vehicle, vehicle.curve, "none")
+    (tmp_path / "heavy.toml").write_text(to_toml(found), encoding="utf-8")
+    assert load_vehicle(str(tmp_path / "heavy.toml")).inertial.wet_kg > vehicle.inertial.wet_kg
+    np.testing.assert_allclose(np.diag(assemble_vehicle(found).mass)[:3], 1.15 * np.diag(assemble_vehicle(vehicle).mass)[:3])
