@@ -348,7 +348,7 @@ def _check_box(vehicle: Vehicle, source: Source) -> None:
     if wet_kg > vehicle.most_wet_kg * (1.0 + 1e-9):
         water_kg = vehicle.most_wet_kg / MOST_OVER_HULL
         what = f"{wet_kg:g} kg, entrained water included, cannot float: {box}, displaces {water_kg:.3g} kg of water"
-        raise source.error(("inertial", "dry_kg"), what)
+        raise source.error(("inertial", "dry_kg"), f"{what}; hull.size_m is that of the box around all parts, foam and frame too")
     for i, tag in enumerate(vehicle.tag):
         on = np.abs(np.abs(tag.position_m) - half) < ON_FACE_M
         if on.any() and np.max((tag.outward * np.sign(tag.position_m))[on]) < LOOKS_INTO:
