@@ -25,9 +25,9 @@ CENTRED_M = 1e-9
 """Distance of the mean IMU position from the centre of mass below which the IMUs count as centred: the rest is rounding."""
 ALPHA_S = 0.03
 """Averaging time of the gyro's differences: at 0.3 m of lever their noise makes 0.02 m/s^2; without averaging 0.1 at 100 Hz."""
-GAP_NS = 10_000_000
+GAP_NS = 15_000_000
 """Longest time between two gyro readings, or a tick if that is longer, over which their difference tells the angular acceleration: an IMU
-may be slower than the tick."""
+may be slower than the tick, as one of 100 Hz, which by its own clock comes a tick late at 200 Hz."""
 GYRO_BIASES, ACCEL_BIASES, DEPTH_BIASES = 0.1, 1.0, 0.5
 """Largest plausible deviation of a sensor from the mean of all, rad/s, m/s^2, m: twenty sigmas and more of the bench's draw of biases. A
 failed sensor reads zeros or its limit, off by gravity, until it is found."""

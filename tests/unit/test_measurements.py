@@ -375,6 +375,16 @@ def test_imus_that_are_slower_than_the_tick_are_told_apart_and_feel_the_turn(bod
     np.testing.assert_allclose(measured.accel, PUSHED, atol=1e-3)
 
 
+@pytest.mark.parametrize(("period_ns", "gaps"), [(PERIOD // 2, (1, 3)), (PERIOD // 4, (3, 5))])
+def test_imu_of_100_hz_that_comes_a_tick_early_and_a_tick_late_feels_the_turn(body: Body, period_ns: int, gaps: tuple[int, int]) -> None:
+    """Regression: by its own clock, each reading that came late began the angular acceleration anew."""
+    measurements, comes = Measurements(body, period_ns), set(np.cumsum(gaps * 100).tolist())
+    for tick in range(max(comes) + 1):
+        measured = turning(measurements, (0,) if tick in comes else (), RATE + ALPHA * tick * period_ns * 1e-9, ALPHA)
+    assert measured.accel is not None
+    np.testing.assert_allclose(measured.accel, PUSHED, atol=1e-3)
+
+
 def test_depth_is_told_by_the_density_that_drags() -> None:
     cube = load_vehicle("modcube")
     lone = assemble([(0, 0, 0)], [0], [cube], [0])
