@@ -60,10 +60,11 @@ def code_digest() -> str:
 
 
 def identity(scenario: Scenario, parameters: Parameters) -> str:
-    """Digest of everything that determines a trial, apart from its seed. Of a waypoint file the text counts, not the folder."""
+    """Digest of everything that determines a trial, apart from its seed. Of waypoint and vehicle files the text counts, not the folder."""
     task = dataclasses.replace(scenario.task, file=Path(scenario.task.file).name)
-    scenario = dataclasses.replace(scenario, task=task)
     vehicles = [load_vehicle(m.vehicle) for m in scenario.module]
+    modules = tuple(dataclasses.replace(m, vehicle=Path(m.vehicle).name) for m in scenario.module)
+    scenario = dataclasses.replace(scenario, task=task, module=modules)
     meshes = [hashlib.sha256(Path(v.hull.mesh).read_bytes()).hexdigest() if v.hull.mesh else "" for v in vehicles]
     parts = (code_digest(), dataclasses.asdict(scenario), list(map(dataclasses.asdict, vehicles)), meshes, dataclasses.asdict(parameters))
     return hashlib.sha256(repr(parts).encode()).hexdigest()

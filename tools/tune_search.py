@@ -10,7 +10,7 @@ import hashlib
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,11 +43,12 @@ class Progress(NamedTuple):
 
 def identity(objective: Objective, start: Parameters, seed: int) -> str:
     """Hash of the search: with the same identity and number, a trial is the same. Covers the objective, the flights as they are in their
-    files, the start, the seed, and the code here and in the packages.
+    files, which may lie in any folder, the start, the seed, and the code here and in the packages.
     """
+    named = tuple(replace(spec, scenario=Path(spec.scenario).name, vehicle=Path(spec.vehicle).name) for spec in objective.flight)
     flights = [campaign.identity(spec.flown(), start) for spec in objective.flight]
     here = [(Path(__file__).parent / name).read_bytes() for name in SOURCES]
-    parts = (flights, hashlib.sha256(b"".join(here)).hexdigest(), asdict(objective), seed)
+    parts = (flights, hashlib.sha256(b"".join(here)).hexdigest(), asdict(replace(objective, flight=named)), seed)
     return hashlib.sha256(repr(parts).encode()).hexdigest()
 
 

@@ -256,6 +256,19 @@ def test_files_that_an_objective_names_lie_beside_it(tools: tuple[Any, Any], tmp
     assert objective.vehicle == str(tmp_path / "mine.toml") and objective.flight[0].flown().name == "hover"
 
 
+def test_search_is_the_same_in_whatever_folder_its_files_are_named(
+    tools: tuple[Any, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Regression: one that was killed was refused as another where its objective was named by a longer path."""
+    (tmp_path / "mine.toml").write_text((ROOT / "firmware_py" / "vehicles" / "bluerov2.toml").read_text())
+    named = re.sub('scenario = "[a-z-]+"', 'scenario = "hover", vehicle = "mine.toml"', OBJECTIVE)
+    there = objective_of(tools, tmp_path, named)
+    monkeypatch.chdir(tmp_path)
+    here = objective_of(tools, Path(), named)
+    assert here.vehicle != there.vehicle
+    assert tools[1].identity(here, START, 0) == tools[1].identity(there, START, 0)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hover", "shipped", "spiral", "spiral-and-push"])
 def test_objectives_that_are_shipped_can_be_flown(tools: tuple[Any, Any], name: str) -> None:
