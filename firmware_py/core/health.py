@@ -57,7 +57,7 @@ class Health(NamedTuple):
     """Places of thrusters whose ESC does not answer, or reports a fault."""
     frame_errors_per_s: float
     bus_load: float
-    """Share of the fullest bus in use, mean of a second."""
+    """Share of the fullest bus in use, mean of a second, or of the time since the start."""
     missed_percent: float
     """Share of the ticks that were missed, mean of a second, %."""
     foreign_sync: bool

@@ -173,7 +173,7 @@ class HealthMonitor:
             bus_silent_s=max(now - max(self._reports.heard_ns.values()), stopped_ns) * 1e-9,
             esc_missing=tuple([self._places[i] for i in _older(self._esc_ns, now - self._esc_fresh_ns)]),
             frame_errors_per_s=latest.error_rate,
-            bus_load=latest.bus_load,
+            bus_load=latest.bus_load / -math.expm1((latest.start_ns - now - self._period_ns) * 1e-9 / MEAN_S),
             missed_percent=latest.missed_percent,
             foreign_sync=now - latest.foreign_sync_ns <= FOREIGN_NS,
             foreign_command=now - latest.foreign_command_ns <= FOREIGN_NS,

@@ -367,11 +367,12 @@ def test_e_stop_box_counts_once_it_was_heard_by_any_part_of_the_body() -> None:
     assert bench.step().estop_box_age_s == 0.0, "whenever it speaks"
 
 
-def test_bus_load_is_the_share_of_a_second() -> None:
+def test_bus_load_is_the_share_of_a_second_and_from_the_start_that_of_the_time_since() -> None:
+    """Regression: with --hold a robot armed 0.5 s after its start, when a full bus still counted as 40 % full."""
     bench = MonitorBench()
-    bench.busy_s = 0.6 * 1e-9 * TICK_NS
-    assert bench.wait(1.0).bus_load == pytest.approx(0.6 * (1.0 - math.exp(-1.0)), rel=0.02)
-    assert bench.wait(9.0).bus_load == pytest.approx(0.6, rel=0.01)
+    for busy, waited_s, share in ((0.9, 0.02, 0.9), (0.9, 0.5, 0.9), (0.9, 9.0, 0.9), (0.3, 1.0, 0.3 + 0.6 * math.exp(-1.0))):
+        bench.busy_s = busy * 1e-9 * TICK_NS
+        assert bench.wait(waited_s).bus_load == pytest.approx(share, rel=0.02)
 
 
 def test_bad_frames_and_missed_ticks_are_rates() -> None:
