@@ -37,9 +37,9 @@ MOST_STEP_M = 0.5
 """Largest offset that a sensor may take on in flight: five sigmas of the filter's initial depth bias."""
 MOST_SPEED_M_S, DROP_SPEED_M_S = 2.0, 6.0
 """Greatest speed up or down of a body that is armed, twice that of a module at full thrust; and of one that is not, dropped from 2 m."""
-LEAST_NS = 16_000_000
-"""Least time between two readings of a sensor that are used: four fifths of their period (can_dbc/modcube.dbc). The counts below, and those
-of `depth_datum`, are for half a second and two; a sensor that is heard in every tick would end them within 62 and 250 ms."""
+PERIOD_NS, EARLY_NS = 20_000_000, 10_000_000
+"""Period of a sensor's readings (can_dbc/modcube.dbc), and how much earlier one may come. Others in between are not used: the counts below,
+and those of `depth_datum`, are for half a second and two; a sensor that is heard in every tick would end them within 62 and 250 ms."""
 DOUBT = 25
 """Readings, half a second of DEPTH frames: so many refused ones more than accepted ones make a sensor distrusted, so many steady ones with
 none near between them show an offset, and so many accepted ones make it trusted again. Half of the limit of the fail-safe `depth_lost`."""
@@ -94,7 +94,7 @@ class DepthGate:
             pressure_pa = modules[index].pressure_pa
             if pressure_pa is None:
                 continue
-            is_possible = LEAST_PA <= pressure_pa <= self._most_pa and time_ns - sensor.last_ns >= LEAST_NS
+            is_possible = LEAST_PA <= pressure_pa <= self._most_pa and time_ns >= sensor.due_ns
             passed = is_possible and sensor.passes(time_ns, pressure_pa, expected, below_m[k], self._spread_m, armed)
             if not passed or sensor.offset_m:
                 corrected_pa = pressure_pa - sensor.offset_m * PA_PER_M if passed else None
@@ -109,7 +109,7 @@ class _Sensor:
         offset_m: what it tells too much beyond what the filter has learnt of it, m.
         is_distrusted: whether it is not used, with tags or without.
         was_trusted: whether it ever agreed with the tags.
-        last_ns: time of the last possible reading.
+        due_ns: earliest time of the next reading that is used.
     """
 
     def __init__(self) -> None:
@@ -117,7 +117,7 @@ class _Sensor:
         self.is_distrusted = self.was_trusted = False
         self.datum = DepthDatum()
         self._doubt, self._steady, self._low, self._high = 0, 0, 0.0, 0.0
-        self._last_m, self.last_ns, self._jumped_m = math.nan, NEVER_NS, 0.0
+        self._last_m, self._last_ns, self.due_ns, self._jumped_m = math.nan, 0, NEVER_NS, 0.0
         """Last possible reading, and how far the sensor has jumped since it last agreed with tags or came back."""
         self._unbroken, self._only_jumped = 0, False
         """Readings since it last jumped; whether a jump is all that it is distrusted for."""
@@ -142,13 +142,14 @@ class _Sensor:
     def hear(self, time_ns: int, depth_m: float, speed_m_s: float) -> None:
         """Notes a possible reading, and whether the sensor jumped to it: farther than a body goes at `speed_m_s` since the one before."""
         self.datum.hear(time_ns, depth_m)
-        moved_m, most_m = depth_m - self._last_m, min(LEAST_GATE_M + speed_m_s * 1e-9 * (time_ns - self.last_ns), MOST_STEP_M)
+        moved_m, most_m = depth_m - self._last_m, min(LEAST_GATE_M + speed_m_s * 1e-9 * (time_ns - self._last_ns), MOST_STEP_M)
         self._unbroken += 1
         if abs(moved_m) > most_m:
             self._unbroken = 0
             self._jumped_m += moved_m
             self._jumped_m = self._jumped_m if abs(self._jumped_m) > most_m else 0.0
-        self._last_m, self.last_ns = depth_m, time_ns
+        self._last_m, self._last_ns = depth_m, time_ns
+        self.due_ns = max(self.due_ns, time_ns - EARLY_NS) + PERIOD_NS
 
     def is_continuous(self, armed: bool) -> bool:
         """Whether a reading without tags may be used: the sensor is trusted, and has not jumped, or has settled while the body rests."""
