@@ -154,7 +154,9 @@ class Equations:
         self._loaded = _share(self.time_s, weight)
         self._load = weight or Weight(0.0, 0.0, 0.0, 0.0)
         self._centre = recording.body.r_bm[0]
+        """(3,) middle of the hull from the centre of mass, m: added mass and drag act there."""
         self._added_share = vehicle.inertial.added[:3] / np.diag(recording.body.mass)[:3]
+        """(3,) share of the added mass in the total along each axis, as in the vehicle file."""
         self._hung = recording.body.r_bm[0] + hung_at(self._load, vehicle)
         self._kept: dict[object, tuple[bytes, object]] = {}
 
@@ -177,7 +179,9 @@ class Equations:
         damping = x["rotational"] * np.linalg.norm(w, axis=1, keepdims=True) + x["crossflow"] * (speed.sum(axis=1, keepdims=True) - speed)
         moment = tau[:, 3:] - damping * w - _cross(x["arm"], self._down) - _cross(s, a) - _cross(w, inertia * w)
         moment = moment + _cross(self._centre, drag)
-        turning, water = mass * self._added_share * _cross(w, self._centre), mass * self._added_share
+        # the added mass acts in the middle of the hull: its matrix and its Coriolis terms, moved to the centre of mass (Fossen, 2011)
+        water = mass * self._added_share
+        turning = water * _cross(w, self._centre)
         force = force - water * _cross(turned, self._centre) - _cross(w, turning)
         swum = _cross(self._centre, water * (a - _cross(w, v))) + _cross(w, _cross(self._centre, water * v))
         moment = moment - swum - _cross(v, turning)

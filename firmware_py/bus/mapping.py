@@ -13,7 +13,7 @@ import numpy as np
 
 from firmware_py.bus.codec import Codec, Frame, Receiver, unpack_quaternion
 from firmware_py.bus.codec.receiver import COUNTER, MESSAGE, NUMBER, VALUES
-from firmware_py.bus.load import BIT_RATE, bits_of, frame_bits
+from firmware_py.bus.load import BIT_RATE, bits_of
 from firmware_py.core.types import CHANNELS, MCU_ESTOP, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.fleet import Fleet
 
@@ -92,7 +92,7 @@ class InputCollector:
     def sent(self, frames: Sequence[tuple[int, Frame]]) -> None:
         """Counts frames that go out, each with the index of its bus, among those that occupy it."""
         for bus, frame in frames:
-            self._bits[bus] += frame_bits(len(frame.data))
+            self._bits[bus] += bits_of((frame,))
 
     def take(self, bus: int, frames: Sequence[Frame]) -> None:
         """Takes the frames received on bus `bus`, whatever their contents."""

@@ -94,8 +94,8 @@ class DepthGate:
             pressure_pa = modules[index].pressure_pa
             if pressure_pa is None:
                 continue
-            is_possible = LEAST_PA <= pressure_pa <= self._most_pa and time_ns >= sensor.due_ns
-            passed = is_possible and sensor.passes(time_ns, pressure_pa, expected, below_m[k], self._spread_m, armed)
+            is_taken = time_ns >= sensor.due_ns and LEAST_PA <= pressure_pa <= self._most_pa
+            passed = is_taken and sensor.passes(time_ns, pressure_pa, expected, below_m[k], self._spread_m, armed)
             if not passed or sensor.offset_m:
                 corrected_pa = pressure_pa - sensor.offset_m * PA_PER_M if passed else None
                 believed[index] = dataclasses.replace(modules[index], pressure_pa=corrected_pa)
@@ -117,7 +117,8 @@ class _Sensor:
         self.is_distrusted = self.was_trusted = False
         self.datum = DepthDatum()
         self._doubt, self._steady, self._low, self._high = 0, 0, 0.0, 0.0
-        self._last_m, self._last_ns, self.due_ns, self._jumped_m = math.nan, 0, NEVER_NS, 0.0
+        self.due_ns = NEVER_NS
+        self._last_m, self._last_ns, self._jumped_m = math.nan, 0, 0.0
         """Last possible reading, and how far the sensor has jumped since it last agreed with tags or came back."""
         self._unbroken, self._only_jumped = 0, False
         """Readings since it last jumped; whether a jump is all that it is distrusted for."""

@@ -345,7 +345,7 @@ def _check_box(vehicle: Vehicle, source: Source) -> None:
     box = f"the hull, a box of {' x '.join(f'{edge:g}' for edge in vehicle.hull.size_m)} m"
     if np.any(np.abs(com) > half):
         raise source.error(("inertial", "com_m"), f"{com.tolist()} m is outside {box} about [0, 0, 0]")
-    if wet_kg > vehicle.most_wet_kg * (1.0 + 1e-9):
+    if wet_kg > vehicle.most_wet_kg * (1.0 + 1e-9):  # identify.py writes the limit itself, as the sum of a dry and an entrained mass
         water_kg = vehicle.most_wet_kg / MOST_OVER_HULL
         what = f"{wet_kg:g} kg, entrained water included, cannot float: {box}, displaces {water_kg:.3g} kg of water"
         raise source.error(("inertial", "dry_kg"), f"{what}; hull.size_m is that of the box around all parts, foam and frame too")
