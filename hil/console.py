@@ -16,7 +16,7 @@ from rich.text import Text
 
 from hil.campaign_summary import surely_not_zero
 from hil.checks import Result
-from hil.metrics import metric_order, shown, shown_limit, shown_value, warnings_title
+from hil.metrics import metric_order, shown, shown_limit, shown_value
 
 SENSITIVITY_METRICS = ("position_rmse_m", "attitude_rmse_rad")
 """Metrics of a campaign for which correlated parameters of the world are printed."""
@@ -130,7 +130,7 @@ def result_table(result: Result) -> Table:
 def warning_lines(warnings: Sequence[str]) -> list[str]:
     """The first warnings of the firmware under a heading, and the number of further ones; empty if there are none."""
     more = [f"  and {len(warnings) - WARNING_LINES} more"] if len(warnings) > WARNING_LINES else []
-    return [f"{warnings_title(warnings)}:", *(f"  {line}" for line in warnings[:WARNING_LINES]), *more] if warnings else []
+    return ["Warnings of the firmware:", *(f"  {line}" for line in warnings[:WARNING_LINES]), *more] if warnings else []
 
 
 def print_result(result: Result, report: Path | None = None, console: Console | None = None) -> None:

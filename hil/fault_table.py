@@ -30,7 +30,7 @@ POSITIONED = (*PLACED, DOCK)
 """Modes that need a position."""
 FACE = FACE_NAMES.index("-x")
 """Index of the face whose magnet breaks: the one that docks."""
-NAME = f"thruster {THRUSTER + 1} of module 0"
+NAME = f"thruster {THRUSTER + 1} of module 1"
 """Its name in the firmware's texts; what breaks is in the first module."""
 
 

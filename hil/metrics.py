@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -263,12 +263,6 @@ def warning_lines(events: Columns, start_ns: int) -> tuple[str, ...]:
     at_s = 1e-9 * (events["log_time"][grave][first] - start_ns)
     times = [f" ({count} x)" if count > 1 else "" for count in counts]
     return tuple(f"{at_s[i]:.1f} s: {texts[i]}{times[i]}" for i in np.argsort(first))
-
-
-def warnings_title(lines: Sequence[str]) -> str:
-    """Title of the warnings of a flight. It says how their texts count modules where one names a module."""
-    counted = ", which counts modules from 0 in the order of the scenario" if any("module" in line for line in lines) else ""
-    return f"Warnings of the firmware{counted}"
 
 
 def refused(rejected: np.ndarray) -> int:

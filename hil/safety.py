@@ -37,7 +37,7 @@ BREAKS_AFTER_S = 10.0
 """Time from the start of the spiral to the fault."""
 COMMANDED_N = 0.3
 """The time to detect a broken thruster counts from its first command above this."""
-LEFT_OUT = re.compile(r"thruster (\d+) of module 0 .*: left out")
+LEFT_OUT = re.compile(r"thruster (\d+) of module 1 .*: left out")
 
 
 def flown(scenario: Scenario, seed: int, parameters: Parameters | None = None, rate_hz: int = USUAL_RATE_HZ) -> Flight:

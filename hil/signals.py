@@ -89,7 +89,7 @@ def read_flight(folder: Path) -> Flight:
     """
     signals, truths = read_signals(folder / SIGNAL_LOG), read_signals(folder / TRUTH_LOG)
     if "/firmware/body0" not in signals or "/plant/body0" not in truths:
-        raise DescriptionError(f"{folder}: no signals or no truth of body 0 in the logs; was the firmware killed all the time?")
+        raise DescriptionError(f"{folder}: no signals or no truth of the first body in the logs; was the firmware killed all the time?")
     firmware, thrusters = signals["/firmware/body0"], truths["/plant/module0"]["force_n"].shape[1]
     truth = _joined(truths)
     _, mine, theirs = np.intersect1d(firmware["tick"], truth["tick"], return_indices=True)

@@ -84,7 +84,7 @@ def check_docks(vehicle: Vehicle, shapes: dict[str, list[Cell]]) -> None:
     """Raises DescriptionError where the modules of a shape, all upright, cannot be docked."""
     for shape, cells in shapes.items():
         try:
-            check_joints([Placement(vehicle, cell, 0) for cell in cells], range(len(cells)), PITCH_M)
+            check_joints([Placement(vehicle, cell, 0) for cell in cells], range(1, len(cells) + 1), PITCH_M)
         except DescriptionError as error:
             raise DescriptionError(f"{shape} of the vehicle {vehicle.name} cannot be docked: {error}; give --cells 0,0,0") from None
 

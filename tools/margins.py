@@ -60,7 +60,7 @@ def check_bodies(modules: Sequence[int], vehicle: str) -> None:
     described = load_vehicle(vehicle)
     for count in modules:
         try:
-            check_joints([Placement(described, cell, 0) for cell in BODIES[count]], range(count), PITCH_M)
+            check_joints([Placement(described, cell, 0) for cell in BODIES[count]], range(1, count + 1), PITCH_M)
         except DescriptionError as error:
             raise DescriptionError(f"{count} of the vehicle {vehicle} cannot be docked: {error}; give --modules 1") from None
 

@@ -8,6 +8,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.docking_decisions import Prepared
 from firmware_py.core.docking_plan import UndockPlan
 from firmware_py.core.joints import turned
+from firmware_py.core.names import name_module
 from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.types import DockRequest, PartRequest
 from firmware_py.description.schema import DescriptionError
@@ -72,7 +73,7 @@ def _parting(request: DockRequest, plan: UndockPlan, pipeline: Pipeline) -> Prep
 def _prepare_dock(request: DockRequest, bodies: Bodies, pipeline: Pipeline, vehicles: Sequence[Vehicle], pitch_m: float) -> Prepared:
     active, target = bodies.get(request.module), bodies.get(request.target_module)
     if active is None or target is None:
-        return Prepared(request, None, (), f"there is no module {request.module} or {request.target_module}")
+        return Prepared(request, None, (), f"there is no {name_module(request.module)} or {name_module(request.target_module)}")
     try:
         if active is target:
             return _parting(request, plan_undock(request, active, vehicles, pitch_m), pipeline)

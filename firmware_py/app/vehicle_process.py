@@ -18,7 +18,7 @@ from firmware_py.app.observers import Observer, recording, recording_buses, tell
 from firmware_py.app.operator import REARM_S, Operator, with_ground
 from firmware_py.app.realtime import RealTimeLoop, open_loop
 from firmware_py.app.service import reporting
-from firmware_py.description.fleet import Fleet
+from firmware_py.description.fleet import Fleet, module_number
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.config import GroundConfig
@@ -178,7 +178,9 @@ def _run_loop(
     """Runs the loop until the operator has said farewell."""
     fleet = loop.firmware.fleet
     stack.enter_context(quiet_garbage())
-    say(f"messages count modules from 0: {', '.join(f'{k} is number {fleet.label(k)}' for k in range(len(fleet.module)))}")
+    renumbered = [label for k in range(len(fleet.module)) if (label := fleet.label(k)) != f"{module_number(k)}"]
+    if renumbered:
+        say(f"texts and commands count modules in the order of the fleet file: {', '.join(renumbered)}")
     say(f"running at {fleet.rate_hz} Hz on {', '.join(fleet.buses)}")
     if notifier is not None:
         stack.callback(notifier.send, "STOPPING=1")  # the first of what ends: now TimeoutStopSec counts, and no longer the watchdog

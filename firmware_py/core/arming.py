@@ -9,8 +9,7 @@ from typing import NamedTuple
 from firmware_py.core.alignment import AGREE_S
 from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
-from firmware_py.core.module_reports import name_modules
-from firmware_py.core.thruster_names import listed
+from firmware_py.core.names import list_thrusters, name_modules
 from firmware_py.core.transitions import MODES, Need
 from firmware_py.core.types import Mode
 from firmware_py.description.parameter_rules import contradictions
@@ -101,11 +100,11 @@ def _sticks(q: Question) -> str:
 
 
 def _escs(q: Question) -> list[str]:
-    return [f"ESC {escs} does not answer" for escs in listed(q.health.esc_missing)]
+    return [f"ESC {escs} does not answer" for escs in list_thrusters(q.health.esc_missing)]
 
 
 def _unknown_escs(q: Question) -> list[str]:
-    return [f"ESC {escs} answers, but the vehicle file has no thruster there" for escs in listed(q.health.esc_unknown)]
+    return [f"ESC {escs} answers, but the vehicle file has no thruster there" for escs in list_thrusters(q.health.esc_unknown)]
 
 
 def _thrusters(q: Question) -> list[str]:

@@ -21,6 +21,7 @@ from firmware_py.core.docking_way import first_blocking_module, obstacle, plans_
 from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.magnet_relays import MagnetRelays
+from firmware_py.core.names import name_module, name_pair
 from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
 from firmware_py.core.setpoint import REST, Wish
 from firmware_py.core.types import (
@@ -39,7 +40,7 @@ from firmware_py.description.parameters import Docking
 
 CHANGED = "the bodies are others than those that it was planned for"
 NO_LONGER = "its body is no longer in DOCK"
-HOLDS = "its body is not in DOCK, and modules {} and {} may still hold each other"
+HOLDS = "its body is not in DOCK, and {} may still hold each other"
 ANOTHER = "another was asked for"
 SURFACES = "the body that it was to go to surfaces"
 LED = "the body that it is to go to is on its way to it: end that dock first"
@@ -129,7 +130,7 @@ class DockingStage:
         mine = [undock for undock in self._undocks if undock.plan.opens[0].module in body.modules]
         for undock in [each for each in mine if self._joints.existing(each.plan.opens)]:
             self._call_off(undock)
-            self._say(WARNING, f"undock of module {undock.plan.opens[0].module} ended: {NO_LONGER}")
+            self._say(WARNING, f"undock of {name_module(undock.plan.opens[0].module)} ended: {NO_LONGER}")
         for dock in [each for each in self._docks if each.active == body.index]:
             self._give_up(dock, NO_LONGER, decisions)
         for dock in [each for each in self._docks if surfaces and each.target == body.index]:
@@ -211,7 +212,7 @@ class DockingStage:
             newest = self._expected.get(whole)
             if holds is not None and newest is not None and newest.target_module not in estimates[whole][0].modules:
                 return ANOTHER  # a dock, since then
-            return "" if holds is None or whole in waiting else HOLDS.format(*sorted(modules_of(holds)))
+            return "" if holds is None or whole in waiting else HOLDS.format(name_pair(*sorted(modules_of(holds))))
         mine, others = (_body_of(module, estimates) for module in (plan.request.module, plan.request.target_module))
         if mine not in waiting:
             return NO_LONGER
@@ -245,7 +246,7 @@ class DockingStage:
     def _give_up(self, dock: Dock, reason: str, decisions: Decisions) -> None:
         """Ends a dock early; a target that was coming goes back to where it held."""
         self._drop(dock)
-        self._say(WARNING, f"dock of module {dock.prepared.request.module} ended: {reason}")
+        self._say(WARNING, f"dock of {name_module(dock.prepared.request.module)} ended: {reason}")
         if dock.sequence.meets_at_w is not None:
             decisions.returning.append(dock.target)
 
@@ -254,7 +255,7 @@ class DockingStage:
         if any(set(map(modules_of, undock.plan.opens)) == opens for undock in self._undocks):
             return
         self._undocks.append(Undock.begun(plan, pipelines, time_ns, bool(self._still_closed(plan)), self._p, self._joints))
-        self._say(INFORMATION, f"undocking module {plan.opens[0].module} from {plan.opens[0].target_module}")
+        self._say(INFORMATION, f"undocking {name_module(plan.opens[0].module)} from {name_module(plan.opens[0].target_module)}")
 
     def _still_closed(self, plan: UndockPlan) -> list[DockRequest]:
         """Joints that magnets have to push open: those not known to be APART."""
@@ -277,7 +278,7 @@ class DockingStage:
         at = estimates[active][1]
         start_pose = REST._replace(p_wb=at.p_wb.copy(), q_wb=at.q_wb.copy())
         self._docks.append(Dock(sequence, PairDetector(pair, self._p), active, target, prepared, start_pose, set()))
-        self._say(INFORMATION, f"docking module {request.module} to {request.target_module}")
+        self._say(INFORMATION, f"docking {name_module(request.module)} to {name_module(request.target_module)}")
 
     # ------------------------------------------------------------ each tick
 
@@ -321,7 +322,7 @@ class DockingStage:
             return None
         if wait.words not in dock.reported:
             dock.reported.add(wait.words)
-            self._say(WARNING, f"dock of module {dock.prepared.request.module} {wait.words}")
+            self._say(WARNING, f"dock of {name_module(dock.prepared.request.module)} {wait.words}")
         return wait.wish
 
     def _end(self, active: int, decisions: Decisions) -> None:
@@ -353,13 +354,13 @@ class DockingStage:
             return
         if held_by:
             self._call_off(undock)
-            self._say(WARNING, f"undock of module {request.module} ended: {held_by}")
+            self._say(WARNING, f"undock of {name_module(request.module)} ended: {held_by}")
             self._end(whole, decisions)
             return
         self.relays.switch(RELAY_OFF, *plan.opens)
         decisions.parts.append(self._part(undock, whole, estimates))
         self._undocks.remove(undock)
-        self._say(INFORMATION, f"module {request.module} is undocked from {request.target_module}")
+        self._say(INFORMATION, f"{name_module(request.module)} is undocked from {name_module(request.target_module)}")
 
     def _part(self, undock: Undock, whole: int, estimates: Estimated) -> Part:
         """Lets the leaving body glide away; if a third body is in its way, the staying one goes the other way; else neither moves."""

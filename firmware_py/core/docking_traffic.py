@@ -11,6 +11,7 @@ from firmware_py.core.docking_decisions import Estimated, Prepared
 from firmware_py.core.docking_detector import PairDetector
 from firmware_py.core.docking_sequence import DockingSequence, Stage
 from firmware_py.core.docking_way import WAY_SLACK, Way, first_blocking_module, way_of_active
+from firmware_py.core.names import name_module
 from firmware_py.core.setpoint import REST, Wish
 from firmware_py.core.types import Estimate
 from firmware_py.description.parameters import Docking
@@ -81,14 +82,14 @@ class Traffic:
         body, at = self._estimates[dock.target]
         way = Way(body, at.p_wb, at.q_wb, to_w, at.q_wb, plan.pitch_m)
         blocker = first_blocking_module(way, thirds_of(self._estimates, dock.active, dock.target), self._p)
-        return "" if blocker is None else f"module {blocker} is where module {plan.request.target_module} comes to meet it"
+        return "" if blocker is None else f"{name_module(blocker)} is where {name_module(plan.request.target_module)} comes to meet it"
 
     def wait(self, dock: Dock) -> Wait | None:
         """What the active body does about a third body that blocks its way, or others that wait for it; None: there are none."""
         if dock.active in self._yielding:
             return Wait(dock.start_pose, "gives way to another")
         course = self._courses.get(dock.active)
-        return None if course is None or course.blocked_by is None else Wait(REST, f"waits: module {course.blocked_by} is on its way")
+        return None if course is None or course.blocked_by is None else Wait(REST, f"waits: {name_module(course.blocked_by)} is on its way")
 
     def _course(self, dock: Dock) -> _Course | None:
         """The course of a dock; None if its active body is not travelling, or there is no third body."""

@@ -11,6 +11,7 @@ from numba import njit
 
 from firmware_py.core.body import Body
 from firmware_py.core.docking_plan import DockPlan, UndockPlan, module_in, pose_of
+from firmware_py.core.names import name_module
 from firmware_py.core.rotations import V, conjugate, difference, exp, multiply, normalise, rotate, to_matrix
 from firmware_py.core.types import Estimate
 from firmware_py.description.parameters import Docking
@@ -137,9 +138,11 @@ def obstacle(
     blocker = nearest_pass(way, *target, WAY_SLACK * p.standoff_m) if staged else None
     blocker = first_blocking_module(way, thirds, p) if blocker is None else blocker
     if blocker is not None:
-        return f"on its way it would come too near to module {blocker}: bring it before that face first"
+        return f"on its way it would come too near to {name_module(blocker)}: bring it before that face first"
     blocker = first_blocking_module(way_of_target(plan, way, *target), thirds, p) if target_approaches else None
-    return "" if blocker is None else f"module {plan.request.target_module}, which is to meet it, would come too near to module {blocker}"
+    if blocker is None:
+        return ""
+    return f"{name_module(plan.request.target_module)}, which is to meet it, would come too near to {name_module(blocker)}"
 
 
 def plans_conflict(plan: DockPlan, other: DockPlan) -> bool:

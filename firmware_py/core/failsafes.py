@@ -11,7 +11,7 @@ from operator import attrgetter
 from typing import NamedTuple
 
 from firmware_py.core.health import NEVER_S, Health
-from firmware_py.core.module_reports import name_modules
+from firmware_py.core.names import name_modules
 from firmware_py.core.transitions import MODE_TABLE, Need
 from firmware_py.core.types import Mode
 from firmware_py.description.failsafe_parameters import Failsafes as FailsafeParameters

@@ -19,10 +19,9 @@ from numba import njit
 from firmware_py.core.body import Body, deceleration_of, rank_by, rank_of
 from firmware_py.core.command_watch import CommandWatch
 from firmware_py.core.missing_thrust import MissingThrust
-from firmware_py.core.module_reports import name_modules
+from firmware_py.core.names import name_modules, name_thruster, places_of
 from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import polynomial
-from firmware_py.core.thruster_names import name_of, places_of
 from firmware_py.core.topology import in_both
 from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
@@ -114,7 +113,7 @@ class FaultDetector:
         self._pair_at = [{c: (at.get(c, -1), at.get(c + 1, -1)) for c in range(max(at) + 1)} for at in self._thruster_at]
         """Per module and first channel of an ESC feedback: the indices of its two thrusters, -1 where there is none."""
         self._modules = body.modules
-        self._names = tuple(map(name_of, places_of(body)))
+        self._names = tuple(map(name_thruster, places_of(body)))
         self._full_n = np.array([(polynomial(f, 1.0), polynomial(r, 1.0)) for f, r in zip(t.forward, t.reverse, strict=True)])
         """(n, 2) forces at full speed forward and in reverse, N."""
         self._motion = MissingThrust(body, parameters, period_ns)

@@ -9,7 +9,7 @@ import math
 from typing import NamedTuple
 
 from firmware_py.core.module_reports import ModuleReports
-from firmware_py.core.thruster_names import Place
+from firmware_py.core.names import Place, name_pair
 from firmware_py.core.types import DockRequest
 
 NEVER_S = 1e9
@@ -142,7 +142,7 @@ class Health(NamedTuple):
             return ""
         first, more = self.open_joints[0], len(self.open_joints) - 1
         others = f", and {more} more pairs" if more else ""
-        return f"modules {first.target_module} and {first.module} do not hold together{others}"
+        return f"{name_pair(first.target_module, first.module)} do not hold together{others}"
 
     @property
     def any_late(self) -> bool:

@@ -13,8 +13,8 @@ from firmware_py.core.faults import ESC_DOWN, ThrusterFaults, by_channel
 from firmware_py.core.fence import outside
 from firmware_py.core.health import Health
 from firmware_py.core.module_reports import ModuleReports
+from firmware_py.core.names import Place, places_of
 from firmware_py.core.rotations import difference, rotate
-from firmware_py.core.thruster_names import Place, places_of
 from firmware_py.core.types import (
     MCU_ESTOP,
     MCU_UNFIT,

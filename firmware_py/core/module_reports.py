@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 
+from firmware_py.core.names import name_modules
 from firmware_py.core.types import NEVER_NS
-
-
-def name_modules(modules: Iterable[int]) -> str:
-    """Returns the names of modules by their fleet indices: "module 1, 3"."""
-    return f"module {', '.join(map(str, modules))}"
 
 
 class ModuleReports:

@@ -6,12 +6,13 @@ An invalid request from any client gets no farther than this file.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from firmware_py.core.body import Body
+from firmware_py.core.names import name_module, name_modules, name_pair
 from firmware_py.core.transitions import MODES
 from firmware_py.core.types import FACES, WARNING, Action, DockRequest, Event, Mode, Request, Setpoint, Sticks
 from firmware_py.description.vehicle import face_mismatch
@@ -171,7 +172,7 @@ def against_request(request: Request, bodies: Mapping[int, Body]) -> str:
     if request.action in FOR_ALL:
         return ""
     if request.body not in bodies:
-        return f"there is no body {request.body}; there are {_listed(bodies)}"
+        return f"{name_module(request.body)} leads no body, but {name_modules(sorted(bodies))}"
     if request.action == Action.MOTOR_TEST and request.argument[0] >= (count := bodies[request.body].thrusters.f_max.size):
         return f"there is no thruster {request.argument[0]}; there are {count}, from 0 on"
     if request.action in (Action.DOCK, Action.UNDOCK):
@@ -184,15 +185,11 @@ def _against_faces(action: Action, dock: DockRequest, body: int, bodies: Mapping
     faces = {module: kinds for each in bodies.values() for module, kinds in zip(each.modules, each.faces, strict=True)}
     unknown = {dock.module, dock.target_module} - faces.keys()
     if unknown:
-        return f"there is no module {min(unknown)}; there are {_listed(faces)}"
+        return f"there is no {name_module(min(unknown))}, but {name_modules(sorted(faces))}"
     if dock.module not in bodies[body].modules:
-        return f"module {dock.module} is not of body {body}"
+        return f"{name_module(dock.module)} is not of the body of {name_module(body)}"
     together = dock.target_module in bodies[body].modules
     if together == (action == Action.DOCK):
-        return f"modules {dock.module} and {dock.target_module} are {'already' if together else 'not'} of one body"
+        return f"{name_pair(dock.module, dock.target_module)} are {'already' if together else 'not'} of one body"
     why = "" if together else face_mismatch(faces[dock.module], dock.face, faces[dock.target_module], dock.target_face)
-    return why and f"module {dock.module} cannot dock to module {dock.target_module}: {why}"
-
-
-def _listed(numbers: Iterable[int]) -> str:
-    return ", ".join(str(number) for number in sorted(numbers))
+    return why and f"{name_module(dock.module)} cannot dock to {name_module(dock.target_module)}: {why}"

@@ -10,7 +10,7 @@ from firmware_py.core.arming import Question, against_arming, missing
 from firmware_py.core.failsafes import Failsafes, Level
 from firmware_py.core.health import Health
 from firmware_py.core.joints import modules_of
-from firmware_py.core.module_reports import name_modules
+from firmware_py.core.names import name_modules
 from firmware_py.core.transitions import MODES, ROWS, TRIGGERS, Effect, Guard, Need, State, Transition, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Event, Mode, Request
 from firmware_py.description.parameters import Parameters

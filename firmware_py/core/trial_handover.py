@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from firmware_py.core.body import BUOYANCY_SIGMA_N, Body
-from firmware_py.core.thruster_names import places_of
+from firmware_py.core.names import places_of
 from firmware_py.core.thruster_trial import ThrusterTrial
 from firmware_py.core.topology import BIAS_SPREAD, moved_wrench
 

@@ -41,6 +41,16 @@ def overlaps(cells: Sequence[tuple[int, ...]], modules: Sequence[object]) -> Ite
     return ((i, f"modules {modules[cells.index(cells[i])]} and {modules[i]} overlap in cell {cells[i]}") for i in repeated(cells))
 
 
+def module_number(module: int) -> int:
+    """Returns the number by which people call the module with this fleet index."""
+    return module + 1
+
+
+def module_index(number: int) -> int:
+    """Returns the fleet index of the module that people call by this number."""
+    return number - 1
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Fleet:
     """All modules of one process, in fleet index order."""
@@ -73,9 +83,11 @@ class Fleet:
         return 1_000_000_000 // self.rate_hz
 
     def label(self, index: int) -> str:
-        """Name of a module in error messages: its number, and its bus where there are several."""
-        module = self.module[index]
-        return f"{module.number}" if len(self.buses) == 1 else f"{module.number} on {self.buses[module.bus]}"
+        """Number of a module in the fleet, with that on its bus where it is another or there are several buses: "1 (number 7)"."""
+        module, number = self.module[index], module_number(index)
+        if len(self.buses) > 1:
+            return f"{number} (number {module.number} on {self.buses[module.bus]})"
+        return f"{number}" if module.number == number else f"{number} (number {module.number})"
 
 
 def load_fleet(path: Path) -> Fleet:

@@ -9,6 +9,7 @@ from typing import Any
 
 from firmware_py.core.requests import QUARTERS
 from firmware_py.core.types import CHANNELS, FACES, WARNING, Action, DockRequest, Event, Mode
+from firmware_py.description.fleet import module_index
 from firmware_py.ground.command import ACCEPTED, COMMAND_INT_ONLY, DENIED, FAILED, TEMPORARILY_REJECTED, UNSUPPORTED, Answer, Command
 from firmware_py.ground.dialect import Message
 from firmware_py.ground.identity import CUSTOM_MODE_ENABLED, SETTABLE
@@ -248,14 +249,15 @@ class CommandService:
         return self._accept_or_refuse(reason, "reboot", DENIED)
 
     def _dock(self, command: Command, action: Action) -> Answer:
-        module, face, target, target_face, turns = (int(command.get(i)) for i in range(1, 6))
-        last = len(self._system.subject.picture.modules) - 1
+        number, face, target_number, target_face, turns = (int(command.get(i)) for i in range(1, 6))
+        last = len(self._system.subject.picture.modules)
         reason = _outside(
-            ("module", module, 0, last), ("face", face, 0, FACES - 1), ("target module", target, 0, last),
+            ("module", number, 1, last), ("face", face, 0, FACES - 1), ("target module", target_number, 1, last),
             ("target face", target_face, 0, FACES - 1), ("quarter turns", turns, 0, QUARTERS - 1),
         )  # fmt: skip
-        if reason or module == target:
-            return self._accept_or_refuse(reason or f"module {module} and itself", action.name.lower(), DENIED)
+        if reason or number == target_number:
+            return self._accept_or_refuse(reason or f"module {number} and itself", action.name.lower(), DENIED)
+        module, target = module_index(number), module_index(target_number)
         request = DockRequest(module, face, target, target_face, turns, command.get(6) >= 0.5)
         s = self._system.subject
         parts = action == Action.UNDOCK and s.picture.leader(module) == s.picture.leader(target)

@@ -22,7 +22,7 @@ class GroundConfig:
     identity: str = quantity(
         "generic", choices=tuple(IDENTITIES), help="modes shown to ground stations; generic: PX4's; ardusub: ArduSub's"
     )
-    first_system: int = quantity(1, low=1, high=200, help="MAVLink system id of body 0; body n has this id plus n")
+    first_system: int = quantity(1, low=1, high=200, help="MAVLink system id of a body led by module 1; one led by module n has n - 1 more")
     watch_system: int = quantity(
         0, low=0, high=255, help="system id of the ground station whose loss counts and which may steer; 0: the first one heard"
     )
@@ -31,7 +31,7 @@ class GroundConfig:
     )
     store: str = quantity("", help="folder for parameters and signing key; empty: nothing is stored")
     dock_button: tuple[int, ...] = quantity(
-        (), low=0, high=63, help="request of the dock buttons: module, face, target module, target face; empty: none"
+        (), low=0, high=64, help="request of the dock buttons: module, face, target module, target face; modules count from 1; empty: none"
     )
     logs: str = quantity("", help="folder of the logs that ground stations may download; empty: none")
 
@@ -69,10 +69,9 @@ def load_ground(path: Path, modules: int) -> GroundConfig:
     table, source = read_toml(path)
     config: GroundConfig = build(GroundConfig, table, source)
     docked = config.dock_button[::2]
-    if docked and (max(docked) >= modules or len(set(docked)) == 1):
-        raise source.error(
-            ("dock_button",), f"module {docked[0]} to module {docked[1]}; it needs two modules of the fleet, which has {modules}, from 0 on"
-        )
+    if docked and (not 1 <= min(docked) < max(docked) <= modules):
+        what = f"module {docked[0]} to module {docked[1]}; it needs two modules of the fleet, which has {modules}, from 1 on"
+        raise source.error(("dock_button",), what)
     return config
 
 

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from firmware_py.core.body import Body
 from firmware_py.core.types import WARNING, DockRequest, Inputs, Outputs, Request
-from firmware_py.description.fleet import Fleet
+from firmware_py.description.fleet import Fleet, module_index
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.ground.commands import CommandService
@@ -310,4 +310,4 @@ def _dock_of(config: GroundConfig) -> DockRequest | None:
     if not config.dock_button:
         return None
     module, face, target_module, target_face = config.dock_button
-    return DockRequest(module, face, target_module, target_face)
+    return DockRequest(module_index(module), face, module_index(target_module), target_face)

@@ -13,7 +13,7 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.core.body import ARM_SIGMA_M, BUOYANCY_SIGMA_N, TRIM_SIGMA_M, Body, ThrusterSet, can_make, deceleration_of
-from firmware_py.description.fleet import Fleet
+from firmware_py.description.fleet import Fleet, module_number
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import AXES, MOST_THRUSTERS, Vehicle, too_many_thrusters
 from firmware_py.description.water import GRAVITY
@@ -49,14 +49,14 @@ def assemble(
 
     Raises:
         DescriptionError: too many modules, two in one cell, a probe that meets no drogue, or a module without a joint to the
-            rest; the message names modules by their fleet index.
+            rest; the message numbers modules as all texts do.
     """
     count = len(vehicles)
     modules = tuple(range(count)) if modules is None else tuple(int(m) for m in modules)
     if not 1 <= count <= MOST_MODULES or not len(cells) == len(rotation) == len(modules) == count:
         raise DescriptionError(f"a body has 1 to {MOST_MODULES} modules with cell, rotation and vehicle, not {count}")
     placements = place(cells, rotation, vehicles)
-    check_joints(placements, modules, pitch_m)
+    check_joints(placements, [module_number(module) for module in modules], pitch_m)
     return _body(placements, modules, pitch_m, cache)
 
 

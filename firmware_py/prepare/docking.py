@@ -10,6 +10,7 @@ from firmware_py.core import rotations
 from firmware_py.core.body import Body
 from firmware_py.core.docking_plan import DockPlan, UndockPlan
 from firmware_py.core.joints import joints_of, modules_of, turned
+from firmware_py.core.names import name_module, name_modules, name_pair
 from firmware_py.core.types import DockRequest
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.vehicle import FACE_NORMALS, Vehicle, face_mismatch
@@ -33,7 +34,7 @@ def plan_dock(request: DockRequest, active: Body, target: Body, vehicles: Sequen
     """
     faces, target_faces = vehicles[request.module].faces, vehicles[request.target_module].faces
     if why := face_mismatch(faces, request.face, target_faces, request.target_face):
-        raise DescriptionError(f"module {request.module} cannot dock to module {request.target_module}: {why}")
+        raise DescriptionError(f"{name_module(request.module)} cannot dock to {name_module(request.target_module)}: {why}")
     turn_t = _turn_of(target, request.target_module)
     normal = _rounded(turn_t @ FACE_NORMALS[request.target_face])
     new_turn = _mated(turn_t, request, normal)
@@ -81,14 +82,14 @@ def plan_undock(
     joints = [joint.request for joint in joints_of(whole)]
     wanted, pairs = modules_of(request), [modules_of(joint) for joint in joints]
     if wanted not in pairs:
-        raise DescriptionError(f"modules {near} and {far} are not docked to each other")
+        raise DescriptionError(f"{name_pair(near, far)} are not docked to each other")
     opened = [wanted, *(modules_of(joint) for joint in lost)]
     piece = connected_to(far, [pair for pair in pairs if pair not in opened])
     if near in piece and not lost:
         piece = {far}
     stays = [m for m in whole.modules if m not in piece]
     if near in piece or connected_to(near, [pair for pair in pairs if not pair & piece]) != set(stays):
-        raise DescriptionError(f"modules {near} and {far} are also held together by other modules: undock those first")
+        raise DescriptionError(f"{name_pair(near, far)} are also held together by other modules: undock those first")
     opens = [joint if joint.module in piece else turned(joint) for joint in joints if len(modules_of(joint) & piece) == 1]
     opens.sort(key=lambda joint: modules_of(joint) != wanted)
     way = _away(whole, piece, [_cell_of(whole, joint.module) - _cell_of(whole, joint.target_module) for joint in opens])
@@ -119,8 +120,8 @@ def _away(whole: Body, piece: set[int], steps: Sequence[np.ndarray]) -> np.ndarr
         if not met:
             return np.asarray(way / np.linalg.norm(way))
         around |= met
-    words = [f"module{'s' if len(group) > 1 else ''} {', '.join(map(str, sorted(group)))}" for group in (piece, around)]
-    raise DescriptionError(f"{words[0]} cannot leave, enclosed by {words[1]}: undock one of those first")
+    who, by = name_modules(sorted(piece)), name_modules(sorted(around))
+    raise DescriptionError(f"{who} cannot leave, enclosed by {by}: undock one of those first")
 
 
 def _met(whole: Body, inside: np.ndarray, way: np.ndarray) -> set[int]:

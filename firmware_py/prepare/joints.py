@@ -28,35 +28,35 @@ class Placement:
     rotation: int
 
 
-def check_joints(placements: Sequence[Placement], modules: Sequence[object], pitch_m: float) -> None:
+def check_joints(placements: Sequence[Placement], names: Sequence[object], pitch_m: float) -> None:
     """Refuses placements that cannot be docked.
 
     Args:
         placements: the modules.
-        modules: their fleet indices, or other names for error messages.
+        names: their numbers or other names, for error messages.
         pitch_m: lattice pitch.
 
     Raises:
         DescriptionError: two modules in one cell, an unknown rotation, a payload in another module's cell, a probe that meets
             no drogue, or a module without a joint to the rest.
     """
-    for _, what in overlaps([placement.cell for placement in placements], modules):
+    for _, what in overlaps([placement.cell for placement in placements], names):
         raise DescriptionError(what)
     at: dict[Cell, int] = {}
     for i, placement in enumerate(placements):
         if not 0 <= placement.rotation < 24:
-            raise DescriptionError(f"module {modules[i]}: rotation {placement.rotation} is none of 0 to 23")
+            raise DescriptionError(f"module {names[i]}: rotation {placement.rotation} is none of 0 to 23")
         at[placement.cell] = i
-    _check_payloads(placements, modules, at, pitch_m)
+    _check_payloads(placements, names, at, pitch_m)
     joints: list[frozenset[int]] = []
     for i, placement in enumerate(placements):
         for axis in range(3):
             j = at.get(_neighbour(placement.cell, axis))
-            if j is not None and _joined(placements, modules, i, j, axis):
+            if j is not None and _joined(placements, names, i, j, axis):
                 joints.append(frozenset((i, j)))
     reached = connected_to(0, joints)
-    if lost := [str(modules[i]) for i in range(len(placements)) if i not in reached]:
-        raise DescriptionError(f"no docked face joins module {', '.join(lost)} to module {modules[0]}")
+    if lost := [str(names[i]) for i in range(len(placements)) if i not in reached]:
+        raise DescriptionError(f"no docked face joins module {', '.join(lost)} to module {names[0]}")
 
 
 def _neighbour(cell: Cell, axis: int) -> Cell:
@@ -64,7 +64,7 @@ def _neighbour(cell: Cell, axis: int) -> Cell:
     return x, y, z
 
 
-def _joined(placements: Sequence[Placement], modules: Sequence[object], i: int, j: int, axis: int) -> bool:
+def _joined(placements: Sequence[Placement], names: Sequence[object], i: int, j: int, axis: int) -> bool:
     """Whether the faces between neighbours i and j (i below j along `axis`) dock. Raises DescriptionError for a probe without a drogue."""
     step = np.eye(3)[axis]
     upper, lower = face_towards(placements[i].rotation, step), face_towards(placements[j].rotation, -step)
@@ -73,8 +73,8 @@ def _joined(placements: Sequence[Placement], modules: Sequence[object], i: int, 
         what = "probe" if kinds == "PP" else "a face without drogue"
         first, second = ((i, upper), (j, lower)) if kinds[0] == "P" else ((j, lower), (i, upper))
         raise DescriptionError(
-            f"module {modules[first[0]]}'s probe on face {FACE_NAMES[first[1]]} meets {what} on face "
-            f"{FACE_NAMES[second[1]]} of module {modules[second[0]]}"
+            f"module {names[first[0]]}'s probe on face {FACE_NAMES[first[1]]} meets {what} on face "
+            f"{FACE_NAMES[second[1]]} of module {names[second[0]]}"
         )
     return set(kinds) == {"P", "D"}
 
@@ -89,7 +89,7 @@ def connected_to(start: int, joints: Sequence[frozenset[int]]) -> set[int]:
 
 
 def _check_payloads(
-    placements: Sequence[Placement], modules: Sequence[object], at: Mapping[Cell, int], pitch_m: float
+    placements: Sequence[Placement], names: Sequence[object], at: Mapping[Cell, int], pitch_m: float
 ) -> None:
     for i, placement in enumerate(placements):
         turn = MATRICES[placement.rotation]
@@ -100,6 +100,6 @@ def _check_payloads(
             spans = [range(math.floor(a), math.ceil(b)) for a, b in zip(low, high, strict=True)]
             for cell in ((x, y, z) for x in spans[0] for y in spans[1] for z in spans[2]):
                 if at.get(cell, i) != i:
-                    other = modules[at[cell]]
-                    what = f"payload {payload.name!r} of module {modules[i]}"
+                    other = names[at[cell]]
+                    what = f"payload {payload.name!r} of module {names[i]}"
                     raise DescriptionError(f"{what} is in the way of module {other}")

@@ -17,7 +17,7 @@ import numpy as np
 from firmware_py.description.signals import Columns
 from firmware_py.description.vehicle import Vehicle
 from hil.checks import Result
-from hil.metrics import errors, metric_order, shown, shown_limit, shown_value, warnings_title
+from hil.metrics import errors, metric_order, shown, shown_limit, shown_value
 from hil.plots import Window
 from hil.signals import Flight
 
@@ -227,7 +227,7 @@ def _told(result: Result) -> str:
     """Why no tag was seen, faults that never began and the firmware's warnings, shown under the table; empty if there is none of them."""
     lines = "\n".join(f"<li>{html.escape(line)}</li>" for line in result.warnings)
     lacked = [f"<p>{html.escape(line)}</p>" for line in (result.no_tag_reason, *result.unmet_faults) if line]
-    return "\n".join([*lacked, *([f"<h3>{warnings_title(result.warnings)}</h3>\n<ul>\n{lines}\n</ul>"] if lines else [])])
+    return "\n".join([*lacked, *([f"<h3>Warnings of the firmware</h3>\n<ul>\n{lines}\n</ul>"] if lines else [])])
 
 
 def _plot(path: Path) -> str:

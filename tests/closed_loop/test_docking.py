@@ -180,9 +180,9 @@ def test_module_whose_magnet_fails_in_flight_is_missed(fly: Fly, tmp_path: Path,
     fly(dataclasses.replace(scenario, task=task, fault=(fault,)), 1)
     signals, truth = read_signals(tmp_path / "run" / "signals.mcap"), read_signals(tmp_path / "run" / "truth.mcap")
     said = dict(zip(signals["/events"]["text"].tolist(), (signals["/events"]["log_time"] * 1e-9).tolist(), strict=True))
-    assert 16.0 < said["fail-safe on: a docked partner is lost (modules 0 and 1 do not hold together)"] < (17.0 if magnet == 0.0 else 19.0)
+    assert 16.0 < said["fail-safe on: a docked partner is lost (modules 1 and 2 do not hold together)"] < (17.0 if magnet == 0.0 else 19.0)
     is_torn = magnet < 0.0
-    assert ("module 1 is undocked from 0" in said) == is_torn
+    assert ("module 2 is undocked from module 1" in said) == is_torn
     for m in (0, 1) if is_torn else (0,):
         body = signals[f"/firmware/body{m}"]
         assert (body["state"][-1], body["mode"][-1]) == (State.ARMED, Mode.POSHOLD)

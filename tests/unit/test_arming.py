@@ -12,7 +12,7 @@ from firmware_py.core.arming import CHECKS, Question, against_arming, missing
 from firmware_py.core.body import axes_without_thrust
 from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
-from firmware_py.core.thruster_names import Place
+from firmware_py.core.names import Place
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockRequest, Mode, Request
 from firmware_py.description.failsafe_parameters import Fence
@@ -43,9 +43,9 @@ def test_healthy_robot_may_be_armed_in_every_mode(mode: Mode, forced: bool) -> N
 
 
 HARD: list[tuple[Health, str]] = [
-    (GOOD._replace(silent=(1,)), "module 1 does not answer"),
-    (GOOD._replace(silent=(1, 4)), "module 1, 4 does not answer"),
-    (GOOD._replace(silent=(1,), late=(1,)), "module 1 answers too late, or for another tick"),
+    (GOOD._replace(silent=(1,)), "module 2 does not answer"),
+    (GOOD._replace(silent=(1, 4)), "module 2, 5 does not answer"),
+    (GOOD._replace(silent=(1,), late=(1,)), "module 2 answers too late, or for another tick"),
     (BLIND, "no pose yet"),
     (GOOD._replace(pilot_age_s=0.5, stick=0.04), "sticks are not neutral"),
     (GOOD._replace(warm=False), "compiled code is not warm yet"),
@@ -60,15 +60,15 @@ SOFT: list[tuple[Health, str]] = [
     (GOOD._replace(cabin_age_s=NEVER_S), "cabin was not heard of lately"),
     (GOOD._replace(nis_ratio=6.0), "sensors and model disagree: 6.0 of the expected, 5.0 permitted"),
     (GOOD._replace(rejected_share=0.91), "tags refused: 91% of them, 80% permitted"),
-    (GOOD._replace(unfit=(0, 2)), "module 0, 2 starts, hears no commands, or has a fault"),
-    (GOOD._replace(esc_missing=(Place(0, 0), Place(0, 7))), "ESC 1, 8 of module 0 does not answer"),
-    (GOOD._replace(esc_unknown=(Place(2, 6), Place(2, 7))), "ESC 7, 8 of module 2 answers, but the vehicle file has no thruster there"),
+    (GOOD._replace(unfit=(0, 2)), "module 1, 3 starts, hears no commands, or has a fault"),
+    (GOOD._replace(esc_missing=(Place(0, 0), Place(0, 7))), "ESC 1, 8 of module 1 does not answer"),
+    (GOOD._replace(esc_unknown=(Place(2, 6), Place(2, 7))), "ESC 7, 8 of module 3 answers, but the vehicle file has no thruster there"),
     (GOOD._replace(lost_axes=1), "the thrusters left cannot make every wrench"),
     (GOOD._replace(without_thrust=("pitch",)), "pitch has no thrust: declare it in passive_dof of the vehicle file, or add thrusters"),
     (GOOD._replace(frame_errors_per_s=21.0), "21 bad frames a second, 20 permitted"),
     (GOOD._replace(bus_load=0.93), "bus is 93% full, 80% permitted"),
-    (GOOD._replace(open_joints=(DockRequest(2, 0, 1, 1),)), "modules 1 and 2 do not hold together"),
-    (GOOD._replace(open_joints=(DockRequest(2, 0, 1, 1),) * 3), "modules 1 and 2 do not hold together, and 2 more pairs"),
+    (GOOD._replace(open_joints=(DockRequest(2, 0, 1, 1),)), "modules 2 and 3 do not hold together"),
+    (GOOD._replace(open_joints=(DockRequest(2, 0, 1, 1),) * 3), "modules 2 and 3 do not hold together, and 2 more pairs"),
 ]
 
 
@@ -88,7 +88,7 @@ def test_e_stop_is_never_passed_over() -> None:
     for forced in (False, True):
         assert reasons(estop_age_ms=199.999, forced=forced) == ["e-stop raised"]
         assert reasons(estop_age_ms=200.0, forced=forced) == []
-        assert reasons(GOOD._replace(stopped=(1,)), estop_age_ms=1e4, forced=forced) == ["an e-stop holds module 1"]
+        assert reasons(GOOD._replace(stopped=(1,)), estop_age_ms=1e4, forced=forced) == ["an e-stop holds module 2"]
 
 
 def test_robot_that_has_an_e_stop_box_is_armed_once_the_box_was_heard() -> None:
@@ -165,7 +165,7 @@ def test_checks_are_named_and_their_order_is_that_of_the_reasons() -> None:
         "few bad frames", "bus not full", "topology as configured",
     ]  # fmt: skip
     both = GOOD._replace(silent=(2,), tag_age_s=0.7)
-    assert reasons(both) == ["module 2 does not answer", "pose is 700 ms old, 500 permitted"]
+    assert reasons(both) == ["module 3 does not answer", "pose is 700 ms old, 500 permitted"]
 
 
 BOUNDARIES = [

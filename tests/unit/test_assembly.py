@@ -259,18 +259,18 @@ def test_arrays_of_a_body_suit_compiled_functions(modcube: Vehicle) -> None:
 
 
 def test_module_apart_from_the_others_is_refused_by_name(modcube: Vehicle) -> None:
-    with pytest.raises(DescriptionError, match="module 9 to module 7"):
+    with pytest.raises(DescriptionError, match="module 10 to module 8"):
         assemble([(0, 0, 0), (1, 0, 0), (3, 0, 0)], [0] * 3, [modcube] * 3, modules=[7, 8, 9])
 
 
 def test_two_modules_in_one_place_are_refused_by_name(modcube: Vehicle) -> None:
-    with pytest.raises(DescriptionError, match="modules 4 and 6 overlap"):
+    with pytest.raises(DescriptionError, match="modules 5 and 7 overlap"):
         assemble([(0, 0, 0), (1, 0, 0), (0, 0, 0)], [0] * 3, [modcube] * 3, modules=[4, 5, 6])
 
 
 def test_probe_against_probe_is_refused_by_name(modcube: Vehicle) -> None:
     half_turn = next(i for i, m in enumerate(lattice.MATRICES) if np.array_equal(np.diag(m), [-1, -1, 1]))
-    with pytest.raises(DescriptionError, match=r"module 2's probe on face \+x meets probe on face \+x of module 3"):
+    with pytest.raises(DescriptionError, match=r"module 3's probe on face \+x meets probe on face \+x of module 4"):
         assemble([(0, 0, 0), (1, 0, 0)], [0, half_turn], [modcube] * 2, modules=[2, 3])
 
 
@@ -288,7 +288,7 @@ def test_probe_against_a_bare_face_is_refused(modcube: Vehicle) -> None:
 
 def test_payload_in_a_neighbour_s_place_is_refused_by_name(modcube: Vehicle, lopsided: Vehicle) -> None:
     assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [lopsided, modcube])
-    with pytest.raises(DescriptionError, match="'gripper' of module 0 is in the way of module 1"):
+    with pytest.raises(DescriptionError, match="'gripper' of module 1 is in the way of module 2"):
         assemble([(0, 0, 0), (-1, 0, 0)], [0, 0], [lopsided, modcube])
 
 

@@ -116,7 +116,7 @@ def test_target_that_comes_goes_back_when_the_body_that_it_comes_to_meet_is_take
     held = tank.pipeline.formation.pipelines[0].guidance._held().p_wb.copy()
     tank.run(0.5, Request(Action.DOCK, 2, DockRequest(2, 3, 1, 2, 0, True)))
     tank.run(2.0, Request(Action.UNDOCK, 2, DockRequest(3, 3, 2, 2)))
-    assert tank.shape == [(0, 1), (2,), (3,)] and tank.when(f"dock of module 2 ended: {CHANGED}")
+    assert tank.shape == [(0, 1), (2,), (3,)] and tank.when(f"dock of module 3 ended: {CHANGED}")
     np.testing.assert_allclose(tank.pipeline.formation.pipelines[0].guidance._held().p_wb, held, atol=0.02)
 
 
@@ -134,7 +134,7 @@ def test_target_that_came_and_was_moved_by_a_person_since_stays_there_when_the_d
     tank.run(1.0, move)
     goal = guidance._goal
     outputs = tank.run(1.0, Request(Action.SET_MODE, 1, Mode.POSHOLD))
-    assert outputs.docks == [] and tank.when(f"dock of module 1 ended: {NO_LONGER}")
+    assert outputs.docks == [] and tank.when(f"dock of module 2 ended: {NO_LONGER}")
     assert guidance._goal is goal and (goal is None) == (move is LEFTWARDS)
 
 
@@ -144,7 +144,7 @@ def test_nobody_docks_to_a_body_that_surfaces() -> None:
     outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     assert outputs.docks and outputs.records[1].mode == Mode.DOCK
     outputs = tank.run(0.1, Request(Action.SET_MODE, 0, Mode.SURFACE))
-    assert outputs.docks == [] and tank.when(f"dock of module 1 ended: {SURFACES}")
+    assert outputs.docks == [] and tank.when(f"dock of module 2 ended: {SURFACES}")
     assert [record.mode for record in outputs.records] == [Mode.SURFACE, Mode.POSHOLD]
     assert not any(any(states) for states in tank.pipeline.formation.docking.relays.states)
 
@@ -169,7 +169,7 @@ def test_target_comes_to_meet_the_first_of_two_alone() -> None:
 def test_dock_whose_way_leads_through_a_third_body_is_refused(approach: str) -> None:
     tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (1.1, 1.0), parameters=Parameters().replace("docking.approach", approach))
     outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
-    assert tank.when("dock refused: on its way it would come too near to module 2")
+    assert tank.when("dock refused: on its way it would come too near to module 3")
     assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD and abs(tank.states[1][1] - 2.0) < 0.05
 
 
@@ -178,7 +178,7 @@ def test_dock_whose_target_would_come_through_a_third_body_is_refused() -> None:
     """The active body goes level to the stand-off; the target, which comes half of that way, has another body beside it."""
     tank = tank_with_modules_at((1.0, 0.0), (2.0, 1.5), (1.0, 0.45))
     tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 1, 0, 0, 0, True)))
-    assert tank.when("dock refused: module 0, which is to meet it, would come too near to module 2")
+    assert tank.when("dock refused: module 1, which is to meet it, would come too near to module 3")
     outputs = tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 1, 0, 0)))
     assert len(outputs.docks) == 1
 
@@ -196,7 +196,7 @@ def test_dock_waits_while_a_third_body_is_on_its_way_and_then_goes_on() -> None:
     tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.0), (1.6, 1.0))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     tank.run(8.0, Request(Action.HOLD, 2, rest_at(np.array([1.0, 1.0, 0.8]), np.array([1.0, 0.0, 0.0, 0.0]))))
-    assert tank.when("dock of module 1 waits: module 2 is on its way")
+    assert tank.when("dock of module 2 waits: module 3 is on its way")
     assert sum("waits" in said for _, said in tank.event_log) == 1
     assert min(np.linalg.norm(past[1][:3] - past[2][:3]) for past in tank.past) > 0.4
     assert tank.outputs[-1].docks[0].stage == Stage.PRE_APPROACH
@@ -216,7 +216,7 @@ def test_dock_says_of_each_module_once_that_it_waits_though_two_are_as_near() ->
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("firmware_py.core.docking_traffic.first_blocking_module", lambda *_: next(met))
         tank.run(0.2)
-    assert [said for _, said in tank.event_log if "waits" in said] == [f"dock of module 1 waits: module {m} is on its way" for m in (2, 3)]
+    assert [said for _, said in tank.event_log if "waits" in said] == [f"dock of module 2 waits: module {m} is on its way" for m in (3, 4)]
 
 
 LEVEL, DIAGONAL = (from_euler(0.0, 0.0, yaw) for yaw in (0.0, 0.25 * np.pi))
@@ -244,7 +244,7 @@ def test_approach_waits_while_a_third_body_is_in_its_way_and_then_goes_on(
     tank.run(10.0, send(2, *there))
     (dock,) = tank.outputs[-1].docks
     assert dock.stage == Stage.APPROACH and dock.gap_m > 0.03
-    assert [said for _, said in tank.event_log if "waits" in said] == ["dock of module 1 waits: module 2 is on its way"]
+    assert [said for _, said in tank.event_log if "waits" in said] == ["dock of module 2 waits: module 3 is on its way"]
     assert min(np.linalg.norm(past[1][:3] - past[2][:3]) for past in tank.past) > 0.26
     tank.run(0.1, send(2, 1.6, there[1]))
     while tank.outputs[-1].docks[0].stage == Stage.APPROACH and len(tank.outputs) < 6000:
@@ -258,7 +258,7 @@ def test_target_that_comes_stops_before_a_third_body_and_goes_back(approach: str
     tank = tank_with_modules_at((1.0, 0.0), (1.0, 2.4), (1.6, 0.75), parameters=Parameters().replace("docking.approach", approach))
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     outputs = tank.run(8.0, send(2, 1.0, 0.75))
-    assert tank.when("dock of module 1 ended: module 2 is where module 0 comes to meet it")
+    assert tank.when("dock of module 2 ended: module 3 is where module 1 comes to meet it")
     assert outputs.docks == [] and [record.mode for record in outputs.records] == [Mode.POSHOLD] * 3
     assert min(np.linalg.norm(past[0][:3] - past[2][:3]) for past in tank.past) > CLEAR_M
     assert abs(tank.states[0][1]) < 0.05
@@ -271,7 +271,7 @@ def test_later_of_two_docks_that_are_on_each_other_s_ways_makes_room() -> None:
     tank.run(0.1, *(Request(Action.DOCK, request.module, request) for request in wanted))
     outputs = tank.run(12.0)
     assert [dock.stage for dock in outputs.docks] == [Stage.APPROACH] * 2
-    assert sum("gives way" in said for _, said in tank.event_log) == 1 and tank.when("dock of module 3 gives way to another")
+    assert sum("gives way" in said for _, said in tank.event_log) == 1 and tank.when("dock of module 4 gives way to another")
     assert min(np.linalg.norm(past[1][:3] - past[3][:3]) for past in tank.past) > 0.35
 
 
@@ -283,7 +283,7 @@ def test_dock_that_cannot_go_back_to_make_room_is_given_way_to_by_the_other() ->
     tank.run(6.0, send(4, 1.9, 1.0))
     outputs = tank.run(9.0)
     assert [Stage.APPROACH <= dock.stage <= Stage.VERIFY for dock in outputs.docks] == [True] * 2
-    assert [said for _, said in tank.event_log if "gives way" in said] == ["dock of module 1 gives way to another"]
+    assert [said for _, said in tank.event_log if "gives way" in said] == ["dock of module 2 gives way to another"]
     assert min(np.linalg.norm(past[3][:3] - past[n][:3]) for past in tank.past for n in (1, 4)) > 0.35
 
 
@@ -297,7 +297,7 @@ def test_earlier_of_two_docks_makes_room_where_the_later_one_s_room_is_on_its_wa
         tank.run(0.01)
     tank.run(0.1, send(0, 2.5, 0.3))
     outputs = tank.run(17.0)
-    assert tank.when("dock of module 1 gives way to another")
+    assert tank.when("dock of module 2 gives way to another")
     assert [dock.stage for dock in outputs.docks] == [Stage.APPROACH] * 2
     assert min(np.linalg.norm(past[1][:3] - past[3][:3]) for past in tank.past) > 0.35
 
@@ -309,7 +309,7 @@ def test_dock_to_a_target_that_comes_to_meet_another_waits_until_it_is_there() -
     tank.run(0.5, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2, 0, True)))
     outputs = tank.run(10.0, Request(Action.DOCK, 2, DockRequest(2, 1, 0, 0)))
     assert len(outputs.docks) == 2 and not any("ended" in said for _, said in tank.event_log)
-    assert [said for _, said in tank.event_log if "waits" in said] == ["dock of module 2 waits: module 0 is on its way"]
+    assert [said for _, said in tank.event_log if "waits" in said] == ["dock of module 3 waits: module 1 is on its way"]
 
 
 @pytest.mark.slow

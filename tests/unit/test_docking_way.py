@@ -69,7 +69,7 @@ def test_third_body_is_met_where_the_way_ends_too(approach: str, third_m: tuple[
     plan = plan_dock(DockRequest(1, 3, 0, 2), active, target, [vehicle] * 2)
     start, there, at = (estimate(np.array(p)) for p in ((0.0, 1.5, 0.0), (0.0, 0.0, 0.0), third_m))
     found = obstacle(plan, (active, start), (target, there), [(third, at._replace(ready=is_placed))], False, Docking(approach=approach))
-    assert ("too near to module 2" in found) == is_met
+    assert ("too near to module 3" in found) == is_met
 
 
 def way_past(third_m: tuple[float, ...], length_m: float, cells: list[tuple[int, int, int]]) -> int | None:
@@ -127,7 +127,7 @@ def test_way_of_bodies_whose_places_nobody_knows_is_judged_by_nobody(lost: int) 
     target, active = (assemble([(0, 0, 0)], [0], [vehicle], [m]) for m in range(2))
     plan = plan_dock(DockRequest(1, 1, 0, 0), active, target, [vehicle] * 2)
     through = [(target, estimate(np.zeros(3))), (active, estimate(np.array([-0.6, 0.0, 0.0])))]
-    assert "too near to module 0" in obstacle(plan, through[1], through[0], [], False, Docking())
+    assert "too near to module 1" in obstacle(plan, through[1], through[0], [], False, Docking())
     through[lost] = (through[lost][0], through[lost][1]._replace(ready=False))
     assert obstacle(plan, through[1], through[0], [], False, Docking()) == ""
 

@@ -30,7 +30,7 @@ def test_dock_ends_with_an_e_stop_or_disarming_and_is_not_gone_on_with(stop: str
     tank.run(0.02, *stopping, estop=stop == "e-stop")
     outputs = tank.run(5.0)
     assert outputs.docks == [] and not any(any(states) for states in tank.pipeline.formation.docking.relays.states)
-    assert tank.when("dock of module 1 ended")
+    assert tank.when("dock of module 2 ended")
     tank.run(0.1, Request(Action.CLEAR_ESTOP, 1))
     outputs = tank.run(0.1, Request(Action.ARM, 1))
     before = tank.states[1][:3].copy()
@@ -56,7 +56,7 @@ def test_second_of_two_docks_to_one_body_in_one_tick_lets_go() -> None:
     assert tank.shape == [(0, 1), (2,)]
     assert tank.pipeline.formation.docking.relays.states == [[0, 0, 1, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0] * 6]
     assert outputs.docks == [] and outputs.records[1].mode == Mode.POSHOLD
-    assert tank.when(f"dock of module 2 ended: {CHANGED}")
+    assert tank.when(f"dock of module 3 ended: {CHANGED}")
 
 
 @pytest.mark.slow
@@ -81,7 +81,7 @@ def test_dock_from_afar_glides_to_the_stand_off_and_keeps_it() -> None:
 def test_dock_whose_way_leads_through_the_target_is_refused() -> None:
     tank = tank_with_row(2.0)
     outputs = tank.run(3.0, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))
-    assert tank.when("dock refused: on its way it would come too near to module 0")
+    assert tank.when("dock refused: on its way it would come too near to module 1")
     assert outputs.records[1].mode == Mode.POSHOLD and abs(tank.states[1][1] - 2.0) < 0.05
 
 
@@ -136,7 +136,7 @@ def test_dock_that_is_asked_for_twice_goes_on_and_another_takes_its_place() -> N
     assert [dock.stage for dock in tank.outputs[-1].docks] == [Stage.APPROACH]
     outputs = tank.run(3.0, Request(Action.DOCK, 1, DockRequest(1, 2, 2, 3)))
     assert [(dock.module_a, dock.module_b) for dock in outputs.docks] == [(2, 1)]
-    assert tank.when("dock of module 1 ended: another was asked for")
+    assert tank.when("dock of module 2 ended: another was asked for")
     assert tank.pipeline.formation.docking.relays.states[0] == [0] * 6
     assert outputs.records[1].mode == Mode.DOCK
 
@@ -187,7 +187,7 @@ def test_dock_that_is_asked_for_again_while_it_ends_begins_anew() -> None:
 def test_robot_that_was_flown_away_from_a_dock_is_not_flung_back_when_it_is_told_to_dock_again() -> None:
     tank = on_its_approach(delay=50)
     outputs = tank.run(0.05, Request(Action.SET_MODE, 1, Mode.POSHOLD))
-    assert outputs.docks == [] and tank.when("dock of module 1 ended")
+    assert outputs.docks == [] and tank.when("dock of module 2 ended")
     for _ in range(18):
         tank.run(0.1, Request(Action.STICKS, 1, Sticks((-1.0, 1.0, 0.0))))
     first = len(tank.outputs)
@@ -307,7 +307,7 @@ def test_dock_whose_plan_is_still_awaited_when_the_target_of_the_one_before_is_t
     tank.run(1.0, Request(Action.DOCK, 2, DockRequest(2, 3, 1, 2)))
     tank.run(1.2, Request(Action.UNDOCK, 0, DockRequest(1, 3, 0, 2)))
     outputs = tank.run(1.0, Request(Action.DOCK, 2, DockRequest(3, 0, 5, 1)))
-    assert tank.shape == [(0,), (1,), (2, 3), (4, 5)] and tank.when(f"dock of module 2 ended: {CHANGED}")
+    assert tank.shape == [(0,), (1,), (2, 3), (4, 5)] and tank.when(f"dock of module 3 ended: {CHANGED}")
     assert [(dock.module_a, dock.module_b) for dock in outputs.docks] == [(5, 3)] and outputs.records[2].mode == Mode.DOCK
 
 
@@ -321,5 +321,5 @@ def test_refused_dock_does_not_end_the_one_that_was_asked_for_after_it() -> None
     tank.run(0.1, Request(Action.DOCK, 1, DockRequest(1, 2, 0, 3)))  # through the target
     tank.run(0.15, Request(Action.DOCK, 1, DockRequest(1, 3, 0, 2)))
     outputs = tank.run(1.0)
-    assert tank.when("dock refused") < tank.when("docking module 1 to 0")
+    assert tank.when("dock refused") < tank.when("docking module 2 to module 1")
     assert outputs.records[1].mode == Mode.DOCK

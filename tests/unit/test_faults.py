@@ -19,7 +19,7 @@ def test_thruster_that_stands_still_is_found_within_half_a_second(water: Water, 
     water.fly(1.0)
     water.gain[thruster] = water.speed_factor[thruster] = 0.0
     found = water.run(1.0)
-    assert [words for _, words in found] == [f"thruster {thruster + 1} of module 0 stands still: left out"]
+    assert [words for _, words in found] == [f"thruster {thruster + 1} of module 1 stands still: left out"]
     assert found[0][0] <= 0.5
     assert water.detector.now.dead == (thruster,) and not water.detector.now.alive[thruster]
     assert water.detector.now.lost_axes == 0
@@ -34,7 +34,7 @@ def test_thruster_dead_from_the_start_is_found_within_half_a_second_of_the_first
     while not found:
         found = water.run(DT)
         pushing += DT * (abs(water.believed.force_n[thruster]) > 0.3)
-    assert [words for _, words in found] == [f"thruster {thruster + 1} of module 0 stands still: left out"]
+    assert [words for _, words in found] == [f"thruster {thruster + 1} of module 1 stands still: left out"]
     assert pushing <= 0.5, "the others steer it through zero at times"
 
 
@@ -43,7 +43,7 @@ def test_esc_that_reports_a_failure_is_believed(water: Water, status: int) -> No
     water.fly(0.5)
     water.status[6] = status
     found = water.run(1.0)
-    assert found[0][0] <= 0.41 and found[0][1] == "thruster 7 of module 0 has an ESC that failed: left out"
+    assert found[0][0] <= 0.41 and found[0][1] == "thruster 7 of module 1 has an ESC that failed: left out"
 
 
 def test_three_reports_of_a_failed_esc_in_a_row_are_enough_and_two_are_not(water: Water) -> None:
@@ -53,7 +53,7 @@ def test_three_reports_of_a_failed_esc_in_a_row_are_enough_and_two_are_not(water
         water.status[6] = status
         assert water.run(seconds) == []
     water.status[6] = 1
-    assert [words for _, words in water.run(0.3)] == ["thruster 7 of module 0 has an ESC that failed: left out"]
+    assert [words for _, words in water.run(0.3)] == ["thruster 7 of module 1 has an ESC that failed: left out"]
 
 
 def test_thrusters_of_escs_that_a_sagging_supply_took_along_are_used_again_once_they_are_well(water: Water) -> None:
@@ -63,7 +63,7 @@ def test_thrusters_of_escs_that_a_sagging_supply_took_along_are_used_again_once_
     assert len(water.run(0.5)) == 8 and not water.detector.now.alive.any()
     water.status[:], water.speed_factor[:] = 0, 1.0
     assert water.run(0.85) == []
-    assert {words for _, words in water.run(0.3)} == {f"thruster {n} of module 0 is used again: its ESC is well again" for n in range(1, 9)}
+    assert {words for _, words in water.run(0.3)} == {f"thruster {n} of module 1 is used again: its ESC is well again" for n in range(1, 9)}
     assert water.detector.now.alive.all() and water.run(1.0) == []
 
 
@@ -87,7 +87,7 @@ def test_thruster_that_turns_the_wrong_way_or_races_is_found(water: Water, facto
     water.fly(0.5)
     water.speed_factor[3] = factor
     found = water.run(1.0, 2.0 * PUSH)
-    assert found[0][1] == "thruster 4 of module 0 does not obey: left out" and found[0][0] <= 0.6
+    assert found[0][1] == "thruster 4 of module 1 does not obey: left out" and found[0][0] <= 0.6
 
 
 @pytest.mark.parametrize("factor", [-1.0, 4.0])
@@ -99,7 +99,7 @@ def test_two_feedbacks_of_a_disobedient_thruster_are_enough_and_one_is_not(water
     water.speed_factor[3] = 1.0
     assert water.run(1.0, 2.0 * PUSH) == []
     water.speed_factor[3] = factor
-    assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == ["thruster 4 of module 0 does not obey: left out"]
+    assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == ["thruster 4 of module 1 does not obey: left out"]
 
 
 def test_two_feedbacks_of_a_clear_standstill_are_enough_and_one_is_not(water: Water) -> None:
@@ -111,7 +111,7 @@ def test_two_feedbacks_of_a_clear_standstill_are_enough_and_one_is_not(water: Wa
     water.speed_factor[busy] = 1.0
     assert water.run(1.0, 2.0 * PUSH) == []
     water.speed_factor[busy] = 0.0
-    assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == [f"thruster {busy + 1} of module 0 stands still: left out"]
+    assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == [f"thruster {busy + 1} of module 1 stands still: left out"]
 
 
 @pytest.mark.parametrize("thruster", range(8))
@@ -136,7 +136,7 @@ def test_propeller_that_turns_on_a_disarmed_robot_is_told_of_once_and_anew_when_
     water.fly(1.0)
     assert water.run(1.0, armed=False) == [], "they only run down"
     water.stray_rpm[2] = -0.4 * BODY.thrusters.rpm_at_full[2]
-    assert [words for _, words in water.run(1.0, armed=False)] == ["thruster 3 of module 0 turns though it was told to stand still"]
+    assert [words for _, words in water.run(1.0, armed=False)] == ["thruster 3 of module 1 turns though it was told to stand still"]
     assert water.detector.now.alive.all(), "it is trusted again when it is armed, and judged then"
     water.stray_rpm[2] = 0.0
     assert water.run(1.0, armed=False) == []
@@ -148,7 +148,7 @@ def test_dead_thruster_is_found_although_frames_are_lost(water: Water) -> None:
     water.heard = 0.7
     water.fly(2.0)
     water.gain[2] = water.speed_factor[2] = 0.0
-    assert water.run(1.5)[0][1].startswith("thruster 3 of module 0 ")
+    assert water.run(1.5)[0][1].startswith("thruster 3 of module 1 ")
 
 
 def test_robot_that_is_armed_anew_trusts_its_thrusters_again(water: Water) -> None:
@@ -189,7 +189,7 @@ def test_feedback_that_comes_late_is_compared_with_the_forces_of_its_own_time() 
     """With frames 30 ms late each way healthy thrusters seemed to disobey; without them the robot tumbled."""
     assert _said_with_late_answers(0, 0) == _said_with_late_answers(16, 16) == []
     assert "does not obey" in _said_with_late_answers(16, 0)[0], "it would matter"
-    assert _said_with_late_answers(16, 16, standing=3) == ["thruster 4 of module 0 stands still: left out"]
+    assert _said_with_late_answers(16, 16, standing=3) == ["thruster 4 of module 1 stands still: left out"]
     assert _said_with_late_answers(0, 60_000) == [], "as an answer of the future seems, after a restart"
 
 

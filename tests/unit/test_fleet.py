@@ -8,7 +8,7 @@ import pytest
 
 from firmware_py.app.configuration import configuration_of, firmware_of
 from firmware_py.app.firmware import compose, read_fleet
-from firmware_py.description.fleet import Fleet, load_fleet, single
+from firmware_py.description.fleet import Fleet, Module, load_fleet, single
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 
@@ -64,6 +64,15 @@ def test_tick_is_as_long_as_the_rate_says(rate_hz: int, period_ns: int) -> None:
     assert single(rate_hz=rate_hz).period_ns == period_ns
 
 
+def test_module_is_called_by_its_place_in_the_fleet_and_on_the_bus_where_they_differ() -> None:
+    in_order = Fleet(module=(Module(number=1), Module(number=2)), buses=("virtual:a",))
+    assert [in_order.label(0), in_order.label(1)] == ["1", "2"]
+    shuffled = Fleet(module=(Module(number=2), Module(number=1)), buses=("virtual:a",))
+    assert [shuffled.label(0), shuffled.label(1)] == ["1 (number 2)", "2 (number 1)"]
+    apart = Fleet(module=(Module(number=1), Module(number=1, bus=1)), buses=("virtual:a", "virtual:b"))
+    assert [apart.label(0), apart.label(1)] == ["1 (number 1 on virtual:a)", "2 (number 1 on virtual:b)"]
+
+
 def test_single_module_is_number_one_on_its_bus() -> None:
     fleet = single("modcube_sim", "virtual:x")
     (module,) = fleet.module
@@ -115,11 +124,11 @@ def test_fleet_file_that_names_no_bus_is_refused(tmp_path: Path) -> None:
     ("text", "words"),
     [
         (APART.replace("virtual:a", "can0"), r"fleet\.toml:\d+: buses\[0\]: 'can0': no such kind of bus; it takes virtual:NAME"),
-        (APART, r"fleet\.toml: no docked face joins module 9 to module 7$"),
-        (APART.replace("[2,", "[0,"), r"fleet\.toml: modules 7 and 9 overlap"),
+        (APART, r"fleet\.toml: no docked face joins module 2 \(number 9\) to module 1 \(number 7\)$"),
+        (APART.replace("[2,", "[0,"), r"fleet\.toml: modules 1 \(number 7\) and 2 \(number 9\) overlap"),
         (
             APART.replace('["virtual:a"]', '["virtual:a", "virtual:b"]').replace("number = 9", "number = 7\nbus = 1"),
-            r"fleet\.toml: no docked face joins module 7 on virtual:b to module 7 on virtual:a$",
+            r"fleet\.toml: no docked face joins module 2 \(number 7 on virtual:b\) to module 1 \(number 7 on virtual:a\)$",
         ),
         (
             'buses = ["virtual:a"]\n[[module]]\nnumber = 7\n[[module]]\nnumber = 8\nvehicle = "yacht"\n',

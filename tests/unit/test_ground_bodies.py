@@ -78,7 +78,7 @@ def test_undock_of_a_disarmed_body_is_accepted_once_it_is_two(world: World, clie
     apart = world.robot.bodies
     world.robot.dock()
     world.run(10)
-    client.command(31011, 1, 1, 0, 0)
+    client.command(31011, 2, 1, 1, 0)
     world.run(10)
     assert not client.all("COMMAND_ACK")
     world.robot.bodies = apart
@@ -89,10 +89,10 @@ def test_undock_of_a_disarmed_body_is_accepted_once_it_is_two(world: World, clie
 def test_undock_of_modules_that_are_apart_is_not_accepted_before_it_is_refused(world: World, client: Client) -> None:
     """A tick that had ended before the request decides nothing about it."""
     world.run(10)
-    client.command(31011, 0, 0, 1, 1)
+    client.command(31011, 1, 0, 2, 1)
     world.run(2)
     assert not client.all("COMMAND_ACK")
-    world.robot.events = [Event(WARNING, "UNDOCK refused: modules 0 and 1 are not of one body", 0)]
+    world.robot.events = [Event(WARNING, "UNDOCK refused: modules 1 and 2 are not of one body", 0)]
     world.run(2)
     assert [(ack.command, ack.result) for ack in client.all("COMMAND_ACK")] == [(31011, mavlink.MAV_RESULT_DENIED)]
 

@@ -82,8 +82,9 @@ def test_speed_of_climbing_or_descending_alone_is_denied(world: World, client: C
         (209, (1, 1, 1000, 1), "motor test refused: throttle 1000; it needs 1100 to 1900"),
         (209, (1, 2, 0, 1), "motor test refused: throttle type 2; it needs 0 to 1"),
         (209, (1, 0, NAN, 1), "command 209 refused: its parameter 3 is no number"),
-        (31010, (0, 0, 1, 1), "dock refused: target module 1; it needs 0 to 0"),
-        (31011, (0, 0, 0, 1), "undock refused: module 0 and itself"),
+        (31010, (1, 0, 2, 1), "dock refused: target module 2; it needs 1 to 1"),
+        (31010, (0, 0, 1, 1), "dock refused: module 0; it needs 1 to 1"),
+        (31011, (1, 0, 1, 1), "undock refused: module 1 and itself"),
     ],
 )
 def test_command_that_makes_no_sense_is_denied_in_words(
@@ -287,7 +288,7 @@ def test_one_refusal_answers_one_command(world: World, client: Client) -> None:
 def test_parameters_of_a_command_without_a_place_are_plain_in_command_int() -> None:
     world = World(modules=2)
     client = world.client()
-    client.send("COMMAND_INT", 1, 1, 0, 31010, 0, 0, 0, 0, 1, 1, 2, 1, 0)
+    client.send("COMMAND_INT", 1, 1, 0, 31010, 0, 0, 1, 0, 2, 1, 2, 1, 0)
     world.run(2)
     assert world.robot.asked[-1].argument == DockRequest(0, 0, 1, 1, 2, True)
 
@@ -296,7 +297,7 @@ def test_parameters_that_a_command_int_leaves_out_are_none() -> None:
     """INT32_MAX marks an omitted value (MAVLink, COMMAND_INT). Regression: it was taken for a value, and both bodies moved unasked."""
     world = World(modules=2)
     client = world.client()
-    client.send("COMMAND_INT", 1, 1, 0, 31010, 0, 0, 0, 0, 1, 1, 2**31 - 1, 2**31 - 1, NAN)
+    client.send("COMMAND_INT", 1, 1, 0, 31010, 0, 0, 1, 0, 2, 1, 2**31 - 1, 2**31 - 1, NAN)
     world.run(2)
     assert world.robot.asked[-1].argument == DockRequest(0, 0, 1, 1)
 
@@ -359,17 +360,20 @@ def test_ardusub_identity_counts_motors_from_0_and_its_middle_is_50_percent(kind
 def test_dock_and_undock_are_user_commands() -> None:
     world = World(modules=2)
     client = world.client()
-    client.command(31010, 0, 0, 1, 1, 2, 1)
-    client.command(31011, 0, 0, 1, 1)
+    client.command(31010, 1, 0, 2, 1, 2, 1)
+    client.command(31011, 1, 0, 2, 1)
     world.run(2)
     wanted = [(Action.DOCK, DockRequest(0, 0, 1, 1, 2, True)), (Action.UNDOCK, DockRequest(0, 0, 1, 1))]
     assert [(r.action, r.argument) for r in world.robot.asked] == wanted
-    assert ask(world, client, 31010, 0, 0, 0, 1) == mavlink.MAV_RESULT_DENIED
+    assert ask(world, client, 31010, 1, 0, 1, 1) == mavlink.MAV_RESULT_DENIED
 
 
 @pytest.mark.parametrize(
-    "parameters", [(0, 6, 1, 1), (0, 0, 1, 6), (0, -1, 1, 1), (0, 0, 2, 1), (2, 0, 1, 1), (1, 0, 1, 1), (0, 0, 1, 1, 4)]
-)
+    "parameters",
+    [
+        (1, 6, 2, 1), (1, 0, 2, 6), (1, -1, 2, 1), (1, 0, 3, 1), (3, 0, 2, 1), (2, 0, 2, 1), (0, 0, 2, 1), (1, 0, 0, 1), (1, 0, 2, 1, 4),
+    ],
+)  # fmt: skip
 def test_dock_of_faces_or_modules_that_there_are_not_is_denied(parameters: tuple[float, ...]) -> None:
     world = World(modules=2)
     assert ask(world, world.client(), 31010, *parameters) == mavlink.MAV_RESULT_DENIED

@@ -14,7 +14,7 @@ from tests.unit.ground_world import fleet_of
 FILE = """links = ["udpin::14550+trusted"]
 identity = "ardusub"
 watch_system = 255
-dock_button = [0, 0, 1, 1]
+dock_button = [1, 0, 2, 1]
 """
 
 
@@ -40,7 +40,7 @@ def test_file_gives_the_buttons_and_whom_to_watch_and_the_command_line_other_lin
     config = ground_config(file, ["udpout::14551"], None, None, None, 2)
     assert config is not None
     assert (config.links, config.identity, config.logs) == (("udpout::14551",), "ardusub", "")
-    assert (config.watch_system, config.dock_button) == (255, (0, 0, 1, 1))
+    assert (config.watch_system, config.dock_button) == (255, (1, 0, 2, 1))
     alone = ground_config(file, [], None, None, None, 2)
     assert alone is not None and alone.links == ("udpin::14550+trusted",)
 
@@ -48,9 +48,10 @@ def test_file_gives_the_buttons_and_whom_to_watch_and_the_command_line_other_lin
 @pytest.mark.parametrize(
     ("line", "wrong"),
     [
-        ("dock_button = [0, 0, 1]", "needs four numbers"),
-        ("dock_button = [0, 0, 1, 9]", "face 9; faces are 0 to 5"),
-        ("dock_button = [0, 0, 2, 1]", "dock_button: module 0 to module 2; it needs two modules of the fleet, which has 2"),
+        ("dock_button = [1, 0, 2]", "needs four numbers"),
+        ("dock_button = [1, 0, 2, 9]", "face 9; faces are 0 to 5"),
+        ("dock_button = [0, 0, 2, 1]", "dock_button: module 0 to module 2; it needs two modules of the fleet"),
+        ("dock_button = [1, 0, 3, 1]", "dock_button: module 1 to module 3; it needs two modules of the fleet, which has 2"),
         ("dock_button = [1, 0, 1, 1]", "dock_button: module 1 to module 1; it needs two modules"),
         ("first_system = 0", "permitted: 1 to 200"),
         ("links = []", "has no links"),

@@ -236,7 +236,7 @@ def test_what_a_companion_computer_streams_to_all_leaves_a_radio_its_telemetry_a
 def test_client_that_asks_in_a_loop_for_what_is_refused_leaves_a_radio_its_telemetry(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each refusal was said to all, at the rate of the loop; nothing else fitted through the radio."""
     radio, cable, robot = SlowLink(57.6), SlowLink(math.inf), Robot()
-    robot.refuse[Action.ARM] = "the pose is 1.2 s old; the battery of module 0 is not known; every axis needs thrust, and there is none"
+    robot.refuse[Action.ARM] = "the pose is 1.2 s old; the battery of module 1 is not known; every axis needs thrust, and there is none"
     links = iter((radio, cable))
     monkeypatch.setattr("firmware_py.ground.link.open_link", lambda address, warn: next(links))
     program = mavlink.MAVLink(None, srcSystem=250, srcComponent=1)

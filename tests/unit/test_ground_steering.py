@@ -63,7 +63,7 @@ def test_buttons_act_when_they_are_pressed_not_while_they_are_held(world: World,
 
 
 def test_dock_button_asks_for_the_configured_faces() -> None:
-    world = World(modules=2, config=GroundConfig(dock_button=(0, 0, 1, 1)))
+    world = World(modules=2, config=GroundConfig(dock_button=(1, 0, 2, 1)))
     client = world.client()
     client.send("MANUAL_CONTROL", 1, 0, 0, 500, 0, 1 << 9)
     world.run(1)

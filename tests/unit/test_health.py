@@ -14,10 +14,10 @@ from firmware_py.core.fence import outside
 from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.health_monitor import HealthMonitor
 from firmware_py.core.module_reports import ModuleReports
+from firmware_py.core.names import Place
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import exp
 from firmware_py.core.setpoint import rest_at
-from firmware_py.core.thruster_names import Place
 from firmware_py.core.types import (
     MCU_TIMED_OUT,
     MCU_UNFIT,
@@ -658,7 +658,7 @@ def test_fail_safe_names_the_modules_behind_it_in_a_body_of_several(name: str) -
                 health = bench.step(one, three)
             words.append(watch.words(health))
             assert watch.beyond(health) or bench is alone
-    assert [text.partition(" (")[2] for text in words] == ["module 3)", "", "module 1)", "", "module 1, 3)", ""]
+    assert [text.partition(" (")[2] for text in words] == ["module 4)", "", "module 2)", "", "module 2, 4)", ""]
 
 
 def test_body_inherits_every_report_of_its_modules_and_of_no_other() -> None:

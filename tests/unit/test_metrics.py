@@ -194,7 +194,7 @@ def test_missing_truth_is_said_and_not_passed_over(tmp_path: Path) -> None:
 
 
 def test_every_warning_counts_but_waiting_for_the_first_tags() -> None:
-    texts = np.array(["ARM refused: no pose yet", "armed", "thruster 1 of module 0 does not push as it says: left out", "leak"])
+    texts = np.array(["ARM refused: no pose yet", "armed", "thruster 1 of module 1 does not push as it says: left out", "leak"])
     assert warnings(np.array([4, 6, 4, 2]), texts) == 2
     assert warnings(np.zeros(0, np.int64), np.zeros(0, str)) == 0
 

@@ -44,7 +44,7 @@ def test_lying_thruster_is_found_within_two_seconds(thruster: int, gain: float) 
     water.fly()
     water.gain[thruster] *= gain
     found = water.run(2.0)
-    assert [words for _, words in found] == [f"thruster {thruster + 1} of module 0 does not push as it says: left out"]
+    assert [words for _, words in found] == [f"thruster {thruster + 1} of module 1 does not push as it says: left out"]
 
 
 def test_thruster_is_not_judged_by_the_motion_of_a_robot_that_sees_no_tag_and_is_when_it_sees_one_again() -> None:
@@ -57,7 +57,7 @@ def test_thruster_is_not_judged_by_the_motion_of_a_robot_that_sees_no_tag_and_is
     water.gain[2], water.tag_age_ns = 1.0, 0
     assert water.run(6.0) == []
     water.gain[2] = 0.0
-    assert [words for _, words in water.run(2.0)] == ["thruster 3 of module 0 does not push as it says: left out"]
+    assert [words for _, words in water.run(2.0)] == ["thruster 3 of module 1 does not push as it says: left out"]
 
 
 def test_thruster_is_not_judged_by_the_motion_of_a_robot_that_touches_the_surface() -> None:
@@ -69,7 +69,7 @@ def test_thruster_is_not_judged_by_the_motion_of_a_robot_that_touches_the_surfac
         water.fly()
         water.gain[2] = 0.0
         found[depth_m] = [words for _, words in water.run(2.0)]
-    assert found == {0.1: [], 0.3: ["thruster 3 of module 0 does not push as it says: left out"]}
+    assert found == {0.1: [], 0.3: ["thruster 3 of module 1 does not push as it says: left out"]}
 
 
 @pytest.mark.parametrize("every", [1, 10])
@@ -84,7 +84,7 @@ def test_thruster_is_not_judged_by_the_motion_of_a_robot_from_which_magnets_push
         said += water.run(0.01)
     assert said == []
     water.free = True
-    assert [words for _, words in water.run(2.0)] == ["thruster 3 of module 0 does not push as it says: left out"]
+    assert [words for _, words in water.run(2.0)] == ["thruster 3 of module 1 does not push as it says: left out"]
 
 
 def test_lying_thruster_is_found_from_the_moment_of_arming() -> None:
@@ -93,7 +93,7 @@ def test_lying_thruster_is_found_from_the_moment_of_arming() -> None:
     assert water.run(2.0, armed=False) == []
     water.detector.reset()
     found = water.run(2.0)
-    assert [words for _, words in found] == ["thruster 6 of module 0 does not push as it says: left out"]
+    assert [words for _, words in found] == ["thruster 6 of module 1 does not push as it says: left out"]
 
 
 def test_lying_thruster_is_found_although_frames_are_lost() -> None:
@@ -101,7 +101,7 @@ def test_lying_thruster_is_found_although_frames_are_lost() -> None:
     water.heard = 0.7
     water.fly()
     water.gain[0] = 0.0
-    assert [words for _, words in water.run(2.0)] == ["thruster 1 of module 0 does not push as it says: left out"]
+    assert [words for _, words in water.run(2.0)] == ["thruster 1 of module 1 does not push as it says: left out"]
 
 
 @pytest.mark.parametrize(("rate_hz", "imu_hz"), [(50, 50), (100, 50), (200, 50), (400, 100), (400, 400)])
@@ -111,7 +111,7 @@ def test_lying_thruster_is_found_by_an_imu_that_is_slower_than_the_tick(rate_hz:
     water.imu_every = rate_hz // imu_hz
     water.fly()
     water.gain[0] = 0.0
-    assert [words for _, words in water.run(2.0)] == ["thruster 1 of module 0 does not push as it says: left out"]
+    assert [words for _, words in water.run(2.0)] == ["thruster 1 of module 1 does not push as it says: left out"]
 
 
 @pytest.mark.slow
@@ -137,7 +137,7 @@ def test_weak_thruster_whose_speed_says_so_does_not_lie_and_one_that_says_too_li
         water.gain[thruster] *= gain
         water.speed_factor[thruster] = speed
         found[gain] = [words for _, words in water.run(5.0, PUSH * np.where(np.arange(8) == thruster, 1.4, 1.0))]
-    assert found == {0.5: [], 0.0: [f"thruster {thruster + 1} of module 0 does not push as it says: left out"]}
+    assert found == {0.5: [], 0.0: [f"thruster {thruster + 1} of module 1 does not push as it says: left out"]}
 
 
 @pytest.mark.parametrize("name", ["modcube", "bluerov2_heavy", "girona500"])

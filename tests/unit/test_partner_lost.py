@@ -238,7 +238,8 @@ def test_undock_that_is_asked_for_twice_parts_once(again: DockRequest) -> None:
         tank.run(0.1, Request(Action.UNDOCK, 0, request))
     tank.run(2.5)
     assert tank.shape == [(0,), (1,)]
-    assert [text for _, text in tank.event_log if "undock" in text] == ["undocking module 1 from 0", "module 1 is undocked from 0"]
+    said = [text for _, text in tank.event_log if "undock" in text]
+    assert said == ["undocking module 2 from module 1", "module 2 is undocked from module 1"]
 
 
 @pytest.mark.slow
@@ -249,7 +250,7 @@ def test_joint_that_a_hanging_relay_holds_is_not_taken_for_undocked(asked: DockR
     tank.stuck = True
     outputs = tank.run(3.0, Request(Action.UNDOCK, 0, asked))
     assert tank.shape == [(0, 1, 2)] and outputs.records[0].mode == Mode.POSHOLD
-    assert tank.when(f"undock of module 2 ended: {IN_PLACE}")
+    assert tank.when(f"undock of module 3 ended: {IN_PLACE}")
     assert tank.pipeline.formation.docking.relays.states[2] == [0, 1, 0, 0, 0, 0], "and pulls again"
     tank.stuck = False
     tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(2, 1, 1, 0)))

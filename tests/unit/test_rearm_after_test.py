@@ -59,7 +59,7 @@ def test_body_in_a_motor_test_is_not_armed_again_and_the_others_are(tmp_path: Pa
     write_log(tmp_path, {0: flies, 1: (DISARMED, Mode.POSHOLD), 2: flies}, {0: flies, 1: tests, 2: flies})
     modules, said = rearmed(tmp_path)
     assert modules == {0, 2}
-    assert said[0].startswith("warning: modules 2 on ") and said[0].endswith(TESTED)
+    assert said[0].startswith("warning: modules 2 (number 2 on ") and said[0].endswith(TESTED)
     assert said[1].startswith("the process before ended in flight")
 
 

@@ -23,7 +23,7 @@ from hil.checks import UNBOUNDED, Limit, Result, judge
 from hil.console import flight_progress, print_result
 from hil.flight import _scene, as_wanted, flown_of, wanted_in
 from hil.force_metrics import force_names
-from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, warning_lines, warnings_title
+from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, warning_lines
 from hil.plot_style import GREY, STYLE
 from hil.plots import (
     JOINED,
@@ -450,7 +450,6 @@ def test_table_and_report_say_what_the_firmware_warned_of(flight: Flight, result
     shown = console.file.getvalue()  # type: ignore[attr-defined]
     assert "Warnings of the firmware:\n  1.0 s: ARM refused: no pose yet (2 x)\n" in shown
     assert "thruster 4" in shown and "thruster 5" not in shown and "and 2 more" in shown
-    assert warnings_title(["2.0 s: thruster 4 of module 1 stands still"]).endswith("counts modules from 0 in the order of the scenario")
     page = write_report(tmp_path, warned, flight, scene(), []).read_text()
     assert "<h3>Warnings of the firmware</h3>" in page
     assert "<li>5.5 s: thruster 6 &lt;weak&gt;</li>" in page

@@ -121,23 +121,23 @@ def test_what_concerns_everybody_may_name_anybody(action: Action) -> None:
 
 
 def test_body_that_is_not_there_is_named_with_those_that_are() -> None:
-    assert against_request(Request(Action.ARM, 7), APART) == "there is no body 7; there are 0, 1"
-    assert against_request(Request(Action.DISARM, 1), {0: PAIR}) == "there is no body 1; there are 0"
+    assert against_request(Request(Action.ARM, 7), APART) == "module 8 leads no body, but module 1, 2"
+    assert against_request(Request(Action.DISARM, 1), {0: PAIR}) == "module 2 leads no body, but module 1"
 
 
 @pytest.mark.parametrize(
     ("action", "body", "dock", "words"),
     [
         (Action.DOCK, 1, DOCK, ""),
-        (Action.DOCK, 1, DOCK._replace(target_module=9), "there is no module 9; there are 0, 1"),
-        (Action.DOCK, 1, DOCK._replace(module=5), "there is no module 5; there are 0, 1"),
-        (Action.DOCK, 0, DOCK, "module 1 is not of body 0"),
-        (Action.DOCK, 1, DOCK._replace(target_module=1), "modules 1 and 1 are already of one body"),
+        (Action.DOCK, 1, DOCK._replace(target_module=9), "there is no module 10, but module 1, 2"),
+        (Action.DOCK, 1, DOCK._replace(module=5), "there is no module 6, but module 1, 2"),
+        (Action.DOCK, 0, DOCK, "module 2 is not of the body of module 1"),
+        (Action.DOCK, 1, DOCK._replace(target_module=1), "modules 2 and 2 are already of one body"),
         (
             Action.DOCK, 1, DOCK._replace(face=0),
-            "module 1 cannot dock to module 0: +x is a probe and +x a probe; a probe docks to a drogue",
+            "module 2 cannot dock to module 1: +x is a probe and +x a probe; a probe docks to a drogue",
         ),
-        (Action.UNDOCK, 1, DOCK, "modules 1 and 0 are not of one body"),
+        (Action.UNDOCK, 1, DOCK, "modules 2 and 1 are not of one body"),
     ],
 )
 def test_dock_or_undock_of_what_is_not_there_is_refused(action: Action, body: int, dock: DockRequest, words: str) -> None:
@@ -146,7 +146,7 @@ def test_dock_or_undock_of_what_is_not_there_is_refused(action: Action, body: in
 
 def test_docked_modules_part_and_do_not_dock_again() -> None:
     assert against_request(Request(Action.UNDOCK, 0, DOCK), {0: PAIR}) == ""
-    assert against_request(Request(Action.DOCK, 0, DOCK), {0: PAIR}) == "modules 1 and 0 are already of one body"
+    assert against_request(Request(Action.DOCK, 0, DOCK), {0: PAIR}) == "modules 2 and 1 are already of one body"
 
 
 def test_sound_requests_keep_their_order_and_the_others_are_answered() -> None:
@@ -154,7 +154,7 @@ def test_sound_requests_keep_their_order_and_the_others_are_answered() -> None:
     sound, events = sift(requests, APART)
     assert sound == [requests[0], requests[2]]
     assert events == [
-        Event(4, "HOLD refused: its argument makes no sense", 0), Event(4, "ARM refused: there is no body 3; there are 0, 1", 3),
+        Event(4, "HOLD refused: its argument makes no sense", 0), Event(4, "ARM refused: module 4 leads no body, but module 1, 2", 3),
     ]  # fmt: skip
 
 
@@ -205,7 +205,7 @@ def test_docked_robot_holds_its_place_or_surfaces_by_the_number_of_either_module
     tank = pair_in_flight()
     tank.run(DT, Request(Action.SET_MODE, 0, Mode.MANUAL))
     assert tank.run(DT, Request(Action.SET_MODE, 1, mode)).records[0].mode == mode
-    assert "there is no body 1" in tank.run(DT, Request(Action.SET_MODE, 1, Mode.MANUAL)).events[0].text
+    assert "module 2 leads no body" in tank.run(DT, Request(Action.SET_MODE, 1, Mode.MANUAL)).events[0].text
 
 
 def test_robot_flies_on_through_every_request_without_sense() -> None:

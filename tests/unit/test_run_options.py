@@ -53,9 +53,9 @@ def test_options_of_the_ground_side_that_cannot_count_are_refused(arguments: lis
 @pytest.mark.slow
 def test_dock_button_of_a_module_that_the_fleet_lacks_is_refused(fleet: Path, refusal: Callable[..., str]) -> None:
     file = fleet.with_name("ground.toml")
-    file.write_text('links = ["udpin:127.0.0.1:0"]\ndock_button = [0, 0, 60, 1]\n')
+    file.write_text('links = ["udpin:127.0.0.1:0"]\ndock_button = [1, 0, 60, 1]\n')
     line = refusal("run", "--fleet", str(fleet), "--ground-file", str(file))
-    assert line.startswith(f"modcube: {file}:2: dock_button: module 0 to module 60; ")
+    assert line.startswith(f"modcube: {file}:2: dock_button: module 1 to module 60; ")
 
 
 def test_one_module_keeps_the_defaults_and_what_the_command_line_says(fleet: Path) -> None:

@@ -51,7 +51,7 @@ class DetectorRig:
 def test_thrusters_of_a_module_that_falls_silent_are_left_out_until_it_is_heard_again() -> None:
     rig = DetectorRig()
     assert rig.run(1.0, 0, 1) == [] == rig.run(0.49, 0)
-    assert rig.run(0.5, 0) == ["thrusters of silent module 1 are left out"]
+    assert rig.run(0.5, 0) == ["thrusters of silent module 2 are left out"]
     assert rig.used == {0} and (rig.detector.now.lost_axes, rig.detector.now.dead) == (0, ()), "nothing was found about them"
     rig.detector._lose(3, "stands still")
     assert rig.run(0.49, 0, 1) == [] and rig.run(0.02, 0, 1) == ["thrusters of every module are used again"]
@@ -61,13 +61,13 @@ def test_thrusters_of_a_module_that_falls_silent_are_left_out_until_it_is_heard_
 def test_module_that_is_heard_now_and_then_is_left_out_once() -> None:
     rig = DetectorRig()
     said = [words for _ in range(5) for words in rig.run(0.55, 0) + rig.run(0.05, 0, 1)]
-    assert said == ["thrusters of silent module 1 are left out"]
+    assert said == ["thrusters of silent module 2 are left out"]
     assert rig.used == {0}
 
 
 def test_module_that_falls_silent_after_all_others_is_used_blindly_and_that_is_said() -> None:
     rig = DetectorRig()
-    assert rig.run(1.0, 0) == ["thrusters of silent module 1 are left out"]
+    assert rig.run(1.0, 0) == ["thrusters of silent module 2 are left out"]
     assert rig.run(1.0) == ["thrusters of every module are used again"] and rig.used == {0, 1}
 
 
@@ -80,7 +80,7 @@ def test_thrusters_that_no_others_can_stand_in_for_are_used_blindly() -> None:
 def test_silence_of_a_disarmed_body_leaves_nothing_out_and_what_was_left_out_is_back_when_it_disarms() -> None:
     rig = DetectorRig()
     assert rig.run(1.0, 0, armed=False) == []
-    assert rig.run(0.02, 0) == ["thrusters of silent module 1 are left out"]
+    assert rig.run(0.02, 0) == ["thrusters of silent module 2 are left out"]
     rig.detector.reset()
     assert rig.detector.changed and rig.used == {0, 1}
 
@@ -103,16 +103,16 @@ def test_body_that_is_made_of_others_leaves_out_the_modules_that_were_silent_in_
 
 def test_thrusters_that_stand_still_because_their_module_hears_no_commands_are_not_found_faulty() -> None:
     rig = DetectorRig(1)
-    assert rig.run(1.0, 0, deaf=0, force_n=2.0) == ["module 0 obeys no commands: its thrusters stop"]
+    assert rig.run(1.0, 0, deaf=0, force_n=2.0) == ["module 1 obeys no commands: its thrusters stop"]
     assert rig.run(0.25, 0, force_n=2.0) == [], "its propellers may still be starting"
     assert rig.used == {0}
-    assert rig.run(0.2, 0, force_n=2.0)[0] == "thruster 1 of module 0 stands still: left out"
+    assert rig.run(0.2, 0, force_n=2.0)[0] == "thruster 1 of module 1 stands still: left out"
 
 
 def test_thrusters_of_a_module_that_hears_no_commands_are_left_out_until_it_does() -> None:
     rig = DetectorRig()
     said = rig.run(1.0, 0, 1, deaf=1)
-    assert said == ["module 1 obeys no commands: its thrusters stop", "thrusters of silent module 1 are left out"]
+    assert said == ["module 2 obeys no commands: its thrusters stop", "thrusters of silent module 2 are left out"]
     assert rig.used == {0}
     assert rig.run(1.0, 0, 1) == ["thrusters of every module are used again"] and rig.used == {0, 1}
 
@@ -126,7 +126,7 @@ def test_liar_in_another_module_is_found_while_a_module_that_hears_no_commands_i
     water.run(4.0, rest)
     water.gain[2] = 0.0
     found = water.run(2.0, rest)
-    assert [words for _, words in found] == ["thruster 3 of module 0 does not push as it says: left out"]
+    assert [words for _, words in found] == ["thruster 3 of module 1 does not push as it says: left out"]
 
 
 class PushingRig(DetectorRig):
@@ -175,7 +175,7 @@ def test_thrusters_of_a_module_that_says_that_it_obeys_no_commands_are_not_found
     """Regression: a microcontroller that restarted in flight, and reported from its start on, lost all its thrusters until disarming."""
     rig = PushingRig()
     assert rig.hear(1.0, turns=True) == []
-    assert rig.hear(1.0, turns=False, mcu_state=state) == ["module 0 obeys no commands: its thrusters stop"]
+    assert rig.hear(1.0, turns=False, mcu_state=state) == ["module 1 obeys no commands: its thrusters stop"]
     assert rig.hear(0.2, turns=False) == [] == rig.hear(1.0, turns=True)
     assert rig.used == {0}
 
@@ -183,4 +183,4 @@ def test_thrusters_of_a_module_that_says_that_it_obeys_no_commands_are_not_found
 def test_thruster_that_stands_still_after_an_interruption_of_the_bus_is_found() -> None:
     rig = PushingRig()
     assert rig.hear(1.0, turns=True) == [] == rig.run(0.3)
-    assert "thruster 1 of module 0 stands still: left out" in rig.hear(0.8, turns=False)
+    assert "thruster 1 of module 1 stands still: left out" in rig.hear(0.8, turns=False)

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 
 from firmware_py.core.failsafes import Level
+from firmware_py.core.names import Place
 from firmware_py.core.supervisor import Decision, Supervisor
-from firmware_py.core.thruster_names import Place
 from firmware_py.core.transitions import ROWS, TABLE, Effect, Guard, State, Transition, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Event, Mode, Request
 from tests.unit.healths import BLIND, GOOD, at
@@ -95,7 +95,7 @@ def test_force_is_the_word_true_alone() -> None:
     for argument in (False, 1, "yes", None):
         supervisor = supervisor_in(State.DISARMED)
         assert ask(supervisor, Action.ARM, argument, GOOD._replace(esc_missing=(Place(0, 0),))) == []
-        assert texts(supervisor) == ["ARM refused: ESC 1 of module 0 does not answer"]
+        assert texts(supervisor) == ["ARM refused: ESC 1 of module 1 does not answer"]
     supervisor = supervisor_in(State.DISARMED)
     assert ask(supervisor, Action.ARM, True, GOOD._replace(esc_missing=(Place(0, 0),))) and supervisor.armed
 
@@ -103,7 +103,7 @@ def test_force_is_the_word_true_alone() -> None:
 def test_all_reasons_are_named_at_once() -> None:
     supervisor = supervisor_in(State.DISARMED)
     ask(supervisor, Action.ARM, True, GOOD._replace(silent=(1,), warm=False))
-    assert texts(supervisor) == ["FORCED_ARM refused: module 1 does not answer; compiled code is not warm yet"]
+    assert texts(supervisor) == ["FORCED_ARM refused: module 2 does not answer; compiled code is not warm yet"]
 
 
 def test_mode_that_lacks_what_it_needs_is_refused() -> None:
@@ -166,7 +166,7 @@ def test_robot_that_raised_an_e_stop_itself_is_armed_once_its_modules_have_let_g
     ask(supervisor, Action.CLEAR_ESTOP, None, at(GOOD, 1.0))
     almost = at(GOOD, 1.2)
     for health, why in (
-        (almost._replace(time_ns=almost.time_ns - 1), "e-stop raised"), (almost._replace(stopped=(1, 3)), "an e-stop holds module 1, 3"),
+        (almost._replace(time_ns=almost.time_ns - 1), "e-stop raised"), (almost._replace(stopped=(1, 3)), "an e-stop holds module 2, 4"),
     ):  # fmt: skip
         assert ask(supervisor, Action.ARM, True, health) == [] and texts(supervisor) == [f"FORCED_ARM refused: {why}"]
         assert not supervisor.may_arm(health)
@@ -178,7 +178,7 @@ def test_module_that_heard_an_e_stop_which_the_firmware_missed_stops_the_robot()
     stopped = GOOD._replace(stopped=(0,))
     (decision,) = supervisor.step(False, stopped, [])
     assert decision.trigger == Trigger.ESTOP_FRAME and supervisor.state == State.ESTOP and not supervisor.raises_estop
-    assert supervisor.events[0] == Event(CRITICAL, "e-stop: module 0 says that it heard one")
+    assert supervisor.events[0] == Event(CRITICAL, "e-stop: module 1 says that it heard one")
     assert supervisor.step(False, stopped, []) == [] and supervisor.events == [], "said once"
     assert ask(supervisor, Action.CLEAR_ESTOP, None, at(stopped, 0.1)) == []
     assert ask(supervisor, Action.CLEAR_ESTOP, None, at(stopped, 0.2)) and supervisor.state == State.DISARMED
@@ -212,7 +212,7 @@ def test_e_stop_that_only_a_module_has_heard_is_latched_after_another_was_cleare
     whole.take_over([supervisor])
     for robot in (supervisor, whole):
         robot.step(False, at(stopped._replace(stopped=(2, 5)), 9.02), [])
-        assert texts(robot) == ["e-stop: module 2, 5 says that it heard one", "DISARMED POSHOLD -> ESTOP POSHOLD"]
+        assert texts(robot) == ["e-stop: module 3, 6 says that it heard one", "DISARMED POSHOLD -> ESTOP POSHOLD"]
         assert robot.state == State.ESTOP and ask(robot, Action.ARM, True, at(GOOD, 10.0)) == []
 
 

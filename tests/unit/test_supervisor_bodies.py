@@ -4,8 +4,8 @@ import pytest
 
 from firmware_py.core.failsafes import Level
 from firmware_py.core.health import Health
+from firmware_py.core.names import Place
 from firmware_py.core.supervisor import Supervisor
-from firmware_py.core.thruster_names import Place
 from firmware_py.core.transitions import State
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Mode, Request
 from tests.unit.healths import BLIND, GOOD, UPRIGHT, at

@@ -27,7 +27,7 @@ def on_trial(thruster: int, since_s: float) -> Water:
     water = Water(seed=thruster)
     water.fly()
     water.pushed = as_if_lost(thruster)
-    assert [words for _, words in water.run(since_s, WANTED)] == [f"thruster {thruster + 1} of module 0 {LEFT_OUT}"]
+    assert [words for _, words in water.run(since_s, WANTED)] == [f"thruster {thruster + 1} of module 1 {LEFT_OUT}"]
     return water
 
 
@@ -38,7 +38,7 @@ def test_thruster_is_used_again_when_the_robot_is_pushed_as_much_without_it(thru
     water.fly()
     water.pushed = as_if_lost(thruster)
     found = [words for _, words in water.run(6.0, WANTED)]
-    assert found == [f"thruster {thruster + 1} of module 0 {LEFT_OUT}", f"thruster {thruster + 1} of module 0 {USED_AGAIN}"]
+    assert found == [f"thruster {thruster + 1} of module 1 {LEFT_OUT}", f"thruster {thruster + 1} of module 1 {USED_AGAIN}"]
     assert water.detector.now.alive.all()
     assert water.detector.now.dead == ()
 
@@ -50,7 +50,7 @@ def test_liar_stays_left_out(thruster: int, gain: float) -> None:
     water = Water(seed=thruster)
     water.fly()
     water.gain[thruster] *= gain
-    assert [words for _, words in water.run(12.0, WANTED)] == [f"thruster {thruster + 1} of module 0 {LEFT_OUT}"]
+    assert [words for _, words in water.run(12.0, WANTED)] == [f"thruster {thruster + 1} of module 1 {LEFT_OUT}"]
     assert water.detector.now.dead == (thruster,)
 
 
@@ -64,13 +64,13 @@ def test_thruster_is_acquitted_twice_and_no_more_until_the_robot_is_armed_again(
         found += [words for _, words in water.run(8.0, WANTED)]
         water.pushed = np.zeros(6)
         found += [words for _, words in water.run(8.0, WANTED)]
-    assert [words for words in found if words.startswith("thruster 2 of module 0 ")] == [
-        *[f"thruster 2 of module 0 {LEFT_OUT}", f"thruster 2 of module 0 {USED_AGAIN}"] * 2, f"thruster 2 of module 0 {LEFT_OUT}",
+    assert [words for words in found if words.startswith("thruster 2 of module 1 ")] == [
+        *[f"thruster 2 of module 1 {LEFT_OUT}", f"thruster 2 of module 1 {USED_AGAIN}"] * 2, f"thruster 2 of module 1 {LEFT_OUT}",
     ]  # fmt: skip
     water.detector.reset()
     water.fly()
     water.pushed = as_if_lost(1)
-    assert [words for _, words in water.run(6.0, WANTED)] == [f"thruster 2 of module 0 {LEFT_OUT}", f"thruster 2 of module 0 {USED_AGAIN}"]
+    assert [words for _, words in water.run(6.0, WANTED)] == [f"thruster 2 of module 1 {LEFT_OUT}", f"thruster 2 of module 1 {USED_AGAIN}"]
 
 
 def test_thruster_stays_left_out_when_tags_are_lost_for_the_rest_of_its_trial() -> None:
@@ -88,7 +88,7 @@ def test_verdict_comes_although_a_block_of_the_trial_could_not_be_measured() -> 
     water.heard = 0.0
     water.run(0.08, WANTED)
     water.heard = 1.0
-    assert [words for _, words in water.run(2.0, WANTED)] == [f"thruster 2 of module 0 {USED_AGAIN}"]
+    assert [words for _, words in water.run(2.0, WANTED)] == [f"thruster 2 of module 1 {USED_AGAIN}"]
 
 
 @pytest.mark.slow
@@ -102,7 +102,7 @@ def test_liar_that_nobody_saw_begin_is_not_acquitted(thruster: int) -> None:
     water.run(6.0, 4.0 * PUSH)
     water.tag_age_ns = 0
     found = [words for _, words in water.run(6.0, 4.0 * PUSH) + water.run(10.0, 0.5 * PUSH)]
-    assert found == [f"thruster {thruster + 1} of module 0 {LEFT_OUT}"]
+    assert found == [f"thruster {thruster + 1} of module 1 {LEFT_OUT}"]
 
 
 @pytest.mark.slow
@@ -112,7 +112,7 @@ def test_bodies_that_join_or_part_do_not_count_acquittals_anew() -> None:
     for _ in range(4):
         for push in (as_if_lost(1), np.zeros(6)):
             water.pushed = push
-            again += sum(words == f"thruster 2 of module 0 {USED_AGAIN}" for _, words in water.run(8.0, WANTED))
+            again += sum(words == f"thruster 2 of module 1 {USED_AGAIN}" for _, words in water.run(8.0, WANTED))
         before, water.detector = water.detector, FaultDetector(BODY, Faults(), TICK_NS)
         water.detector.take_over([before])
     assert again == 2

@@ -79,7 +79,7 @@ def test_help_tells_the_value_of_every_option_that_is_left_out(run: Run, capsys:
         ("characterise", ["--assembly", "fleet.toml", "--module", "modcube"], "characterise: --module tells of what an --assembly of"),
         (
             "margins", ["--vehicle", "bluerov2"],
-            "margins: 2 of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --modules 1",
+            "margins: 2 of the vehicle bluerov2 cannot be docked: no docked face joins module 2 to module 1; give --modules 1",
         ),
         ("margins", ["--controller", "papr"], "margins: controller 'papr' is unknown; did you mean paper? there are modcube, "),
         ("bench_fleet", ["0"], "bench_fleet: argument side: invalid choice: 0 (choose from 1, 2, 3, 4); see --help"),
@@ -148,7 +148,7 @@ def test_every_tool_that_reads_arguments_ends_alike(tool: str) -> None:
         ("build_drag_table", ["--directions", "one"], "build_drag_table: Invalid value for '--directions': Input should be"),
         (
             "build_drag_table", ["--vehicle", "bluerov2", "--cache", "/proc/self/none"],
-            "build_drag_table: line of two of the vehicle bluerov2 cannot be docked: no docked face joins module 1 to module 0; give --",
+            "build_drag_table: line of two of the vehicle bluerov2 cannot be docked: no docked face joins module 2 to module 1; give --",
         ),
         ("build_drag_table", ["--vehicle", "x" * 300], "build_drag_table: vehicle 'xxx"),
         ("build_drag_table", ["--out", "x" * 300 + ".png"], "build_drag_table: --out xxx"),

@@ -31,7 +31,7 @@ def lost(body: Body, thruster: int, wanted: np.ndarray, force_n: float = 1.5) ->
 
 
 def used_again(thruster: int) -> str:
-    return f"thruster {thruster + 1} of module 0 is used again: the robot is pushed as much without it"
+    return f"thruster {thruster + 1} of module 1 is used again: the robot is pushed as much without it"
 
 
 def flying(body: Body, wanted: np.ndarray, seed: int) -> Water:

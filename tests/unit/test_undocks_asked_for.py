@@ -26,7 +26,7 @@ def test_undock_ends_with_its_mode_and_the_joint_holds(stop: str) -> None:
     request = Request(Action.SET_MODE, 0, Mode.POSHOLD) if stop == "mode" else Request(Action.DISARM, 0)
     tank.run(0.02, *([] if stop == "e-stop" else [request]), estop=stop == "e-stop")
     outputs = tank.run(3.0)
-    assert tank.shape == [(0, 1)] and tank.when("undock of module 1 ended")
+    assert tank.shape == [(0, 1)] and tank.when("undock of module 2 ended")
     assert [max(states) for states in tank.pipeline.formation.docking.relays.states] == [1, 1], "and pull again"
     assert outputs.records[0].mode == Mode.POSHOLD
 
@@ -52,7 +52,7 @@ def test_second_of_two_undocks_of_one_body_in_one_tick_is_ended_and_its_joint_ho
     tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)), Request(Action.UNDOCK, 0, DockRequest(2, 1, 1, 0)))
     assert tank.shape == [(0,), (1, 2)]
     assert not any("is undocked from 1" in text for _, text in tank.event_log)
-    assert tank.when("undock of module 2 ended")
+    assert tank.when("undock of module 3 ended")
     assert tank.pipeline.formation.docking.relays.states == [[0] * 6, [1, 0, 0, 0, 0, 0], [0, 1, 0, 0, 0, 0]]
 
 
@@ -73,7 +73,7 @@ def test_undock_that_was_called_off_before_its_plan_came_does_not_part_a_body_th
     for action, wanted in ((Action.UNDOCK, DockRequest(1, 1, 0, 0)), (Action.HOLD, None), (Action.DOCK, DockRequest(1, 0, 2, 1))):
         tank.run(0.1, Request(action, 0, wanted))
     tank.run(2.0)
-    assert tank.when("undock refused: another was asked for") < tank.when("docking module 1 to 2")
+    assert tank.when("undock refused: another was asked for") < tank.when("docking module 2 to module 3")
     assert tank.shape == [(0, 1), (2,)]
 
 
@@ -132,7 +132,7 @@ def test_corner_of_a_ring_stays_where_the_relays_of_a_joint_hang(hung: set[int])
     if len(hung) == 1:  # the other magnet pushes as hard as this one pulls
         assert tank.shape == [(0, 1, 2), (3,)]
         return
-    pushed_s = tank.when(f"undock of module 3 ended: {PULLED}") - tank.when("undocking module 3")
+    pushed_s = tank.when(f"undock of module 4 ended: {PULLED}") - tank.when("undocking module 4")
     assert pushed_s == pytest.approx(2.0 * Parameters().docking.release_s, abs=0.02) and tank.shape == [(0, 1, 2, 3)]
     assert outputs.records[0].mode == Mode.POSHOLD
     assert [sum(states) for states in tank.pipeline.formation.docking.relays.states] == [2] * 4, "and all pull again"
@@ -154,7 +154,7 @@ def test_module_out_of_sight_is_undocked_unless_its_magnets_go_on_pulling(hung: 
     tank.hidden, tank.always_pulling = {1}, hung
     tank.run(2.5, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
     assert tank.shape == ([(0, 1)] if hung else [(0,), (1,)])
-    pushed_s = (tank.when("undock of module 1 ended") if hung else tank.when("module 1 is undocked")) - tank.when("undocking module 1")
+    pushed_s = (tank.when("undock of module 2 ended") if hung else tank.when("module 2 is undocked")) - tank.when("undocking module 2")
     assert pushed_s == pytest.approx((2.0 if hung else 1.0) * Parameters().docking.release_s, abs=0.02)
 
 
@@ -200,7 +200,7 @@ def test_magnets_that_push_one_body_apart_push_on_while_another_parts() -> None:
     while (2, 3) in tank.shape:
         assert tank.pipeline.formation.docking.relays.states[2][0] == RELAY_PUSH
         tank.run(0.01)
-    assert tank.when("module 1 is undocked") < tank.when("module 3 is undocked")
+    assert tank.when("module 2 is undocked") < tank.when("module 4 is undocked")
 
 
 def test_two_corners_of_a_ring_undocked_at_once_leave_no_magnet_on_between_them() -> None:
@@ -208,7 +208,7 @@ def test_two_corners_of_a_ring_undocked_at_once_leave_no_magnet_on_between_them(
     tank = FaultyTank(RING)
     tank.fly()
     tank.run(3.0, Request(Action.UNDOCK, 0, DockRequest(3, 1, 2, 0)), Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
-    assert tank.shape == [(0, 1, 2), (3,)] and tank.when("undock of module 1 ended")
+    assert tank.shape == [(0, 1, 2), (3,)] and tank.when("undock of module 2 ended")
     assert tank.pipeline.formation.docking.relays.states == [[1, 0, 1, 0, 0, 0], [0, 1, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0], [0] * 6]
 
 

@@ -66,7 +66,7 @@ def test_process_killed_in_flight_waits_to_be_armed_otherwise(tmp_path: Path) ->
 PAIR = dock_line(0, (1, 0, 0, 0, 0, 0)) + dock_line(1, (0, 1, 0, 0, 0, 0))
 """Face A of the first module and face B of the second pull."""
 APART = (
-    "warning: modules 1 on {bus}, 2 on {bus} were docked, or about to be, and their magnets let go: "
+    "warning: modules 1 (number 1 on {bus}), 2 (number 2 on {bus}) were docked, or about to be, and their magnets let go: "
     "the fleet file has to say so (body, cell) before they fly as one or REARM arms them"
 )
 
@@ -110,8 +110,8 @@ def test_modules_that_were_undocked_in_flight_are_named_and_not_armed_as_one(
     monkeypatch.setattr(vehicle_process, "Operator", operator)
     fleet = write_log_killed_in_flight(tmp_path, PAIR + UNDOCKED, docked(0, 1))
     said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet, hold=hold)
-    bus = bus_of(tmp_path)
-    assert said[0].startswith(f"warning: modules 1 on {bus}, 2 on {bus} were told to let go of joints that the fleet file has: ")
+    both = "1 (number 1 on {bus}), 2 (number 2 on {bus})".format(bus=bus_of(tmp_path))
+    assert said[0].startswith(f"warning: modules {both} were told to let go of joints that the fleet file has: ")
     assert to_arm == [set()]
     assert HOLDS not in said
     again = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet, hold=hold)

@@ -139,7 +139,7 @@ def of_modules(
         DescriptionError: placements that cannot be docked.
     """
     placements = place(cells, rotation, vehicles)
-    check_joints(placements, range(len(placements)), pitch_m)
+    check_joints(placements, range(1, len(placements) + 1), pitch_m)
     passive = tuple(AXES.index(a) for a in vehicles[0].passive_dof) if len(vehicles) == 1 else ()
     assumption = "; ".join(dict.fromkeys(v.assumption for v in vehicles if v.assumption))
     thrusters = thruster_set(placements, Balance.of(placements, pitch_m).r_bm)

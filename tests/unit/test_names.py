@@ -5,7 +5,7 @@ import pytest
 
 from firmware_py.core.body import Body
 from firmware_py.core.faults import STALLED, WHY, FaultDetector
-from firmware_py.core.thruster_names import Place, listed, name_of, places_of
+from firmware_py.core.names import Place, list_thrusters, name_thruster, places_of
 from firmware_py.core.types import EscFeedback, Event
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.vehicle import load_vehicle
@@ -16,16 +16,16 @@ from tests.unit.robot_in_water import TICK_NS
 
 @pytest.fixture(scope="module")
 def pair() -> Body:
-    """Modules 5 and 2 of a fleet; the first has the eight thrusters of a cube, and so has the second."""
+    """Modules with indices 5 and 2, which people call 6 and 3; the first has the eight thrusters of a cube, and so has the second."""
     return assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [load_vehicle("modcube")] * 2, [5, 2])
 
 
 def test_thrusters_count_from_one_in_each_module(pair: Body) -> None:
     places = places_of(pair)
-    assert [name_of(places[i]) for i in (0, 7, 8, 11)] == [
-        "thruster 1 of module 5", "thruster 8 of module 5", "thruster 1 of module 2", "thruster 4 of module 2",
+    assert [name_thruster(places[i]) for i in (0, 7, 8, 11)] == [
+        "thruster 1 of module 6", "thruster 8 of module 6", "thruster 1 of module 3", "thruster 4 of module 3",
     ]  # fmt: skip
-    assert listed(places[i] for i in (0, 11, 7)) == ["1, 8 of module 5", "4 of module 2"] and listed([]) == []
+    assert list_thrusters(places[i] for i in (0, 11, 7)) == ["1, 8 of module 6", "4 of module 3"] and list_thrusters([]) == []
 
 
 def test_fault_names_the_module_and_the_thruster_there(pair: Body) -> None:
@@ -33,20 +33,20 @@ def test_fault_names_the_module_and_the_thruster_there(pair: Body) -> None:
     detector._lose(11, WHY[STALLED])
     detector._use_again(11, "the robot is pushed as much without it")
     said = [words.partition(":")[0] for words in detector.words]
-    assert said == ["thruster 4 of module 2 stands still", "thruster 4 of module 2 is used again"]
+    assert said == ["thruster 4 of module 3 stands still", "thruster 4 of module 3 is used again"]
     detector.words.clear()
     turning = EscFeedback(2, (0.0, 2000.0), (0.5, 0.5), (0, 0))
     for _ in range(10):
         detector._judge_at_rest([[], [turning]], np.zeros(16))
-    assert detector.words == ["thruster 4 of module 2 turns though it was told to stand still"]
+    assert detector.words == ["thruster 4 of module 3 turns though it was told to stand still"]
 
 
 def test_first_chunk_of_a_text_names_the_thruster() -> None:
     """A STATUSTEXT has 50 characters, and some clients show the first chunk of a long text alone."""
     world = World(modules=2)
     client = world.client()
-    text = f"{name_of(Place(63, 7))} does not push as it says: left out"
+    text = f"{name_thruster(Place(63, 7))} does not push as it says: left out"
     world.robot.events = [Event(4, text, 0)]
     world.run(1)
     first, second = client.all("STATUSTEXT")
-    assert first.text.startswith("thruster 8 of module 63 does not push") and first.text + second.text == text
+    assert first.text.startswith("thruster 8 of module 64 does not push") and first.text + second.text == text
