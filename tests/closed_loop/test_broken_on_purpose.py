@@ -128,7 +128,7 @@ def test_robot_that_no_camera_saw_is_said_to_lack_a_tag(
 @pytest.mark.slow
 def test_flight_without_any_firmware_is_refused_in_one_line(fly: Fly) -> None:
     killed = dataclasses.replace(shortened("hover", 0.5, settle_s=1.1), fault=(Fault(kind="process_killed"),))
-    with pytest.raises(DescriptionError, match="no signals or no truth of body 0 in the logs; was the"):
+    with pytest.raises(DescriptionError, match="no signals or no truth of the first body in the logs; was the"):
         fly(killed)
 
 

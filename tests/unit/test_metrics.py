@@ -187,7 +187,7 @@ def test_result_file_has_the_agreed_shape(tmp_path: Path) -> None:
 def test_missing_truth_is_said_and_not_passed_over(tmp_path: Path) -> None:
     with TruthRecorder(tmp_path, (8,)):
         Recorder(tmp_path).close()
-    with pytest.raises(ValueError, match="no truth of body 0"):
+    with pytest.raises(ValueError, match="no truth of the first body"):
         read_flight(tmp_path)
     with pytest.raises(OSError):
         read_flight(tmp_path / "elsewhere")

@@ -147,7 +147,7 @@ def test_disarmed_body_whose_joint_pictures_show_closed_is_not_undocked() -> Non
     tank.without_current.add(1)
     tank.run(2.0)
     tank.run(0.5, Request(Action.UNDOCK, 0, DockRequest(1, 1, 0, 0)))
-    assert tank.when(f"undock refused: {HOLDS.format(0, 1)}") and tank.shape == [(0, 1)]
+    assert tank.when(f"undock refused: {HOLDS.format('modules 1 and 2')}") and tank.shape == [(0, 1)]
     assert {max(states) for states in tank.pipeline.formation.docking.relays.states} == {RELAY_PULL}
 
 
