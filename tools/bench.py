@@ -46,13 +46,13 @@ OUT = Path("bench.json")
 FLEET_PROGRAM = Path(__file__).with_name("bench_fleet.py")
 FLIGHTS = 3
 REQUIRED_SPEED = 25.0
-"""Times real time that lockstep must reach (issue 2)."""
+"""Times real time that lockstep must reach."""
 PERMITTED_MB = 300.0
-"""Memory of a process with 64 modules (issue 4)."""
+"""Memory of a process with 64 modules."""
 PERMITTED_TIMES = 5.0
-"""Duration of a tick of 64 modules, in those of one (issue 4)."""
+"""Duration of a tick of 64 modules, in those of one."""
 PERMITTED_DETECTION_US = 20.0
-"""Docking detection of eight modules (issue 5)."""
+"""Docking detection of eight modules."""
 
 
 def flight_entries() -> list[Entry]:

@@ -39,7 +39,7 @@ PERIOD_NS = 10_000_000
 RECORDED_TICKS = 300
 BLOCK_TICKS, PAIRS = 50, 40
 PERMITTED_PERCENT = 5.0
-"""Permitted share of a tick's time (issue 6)."""
+"""Permitted share of a tick's time."""
 
 
 class Ticks:
