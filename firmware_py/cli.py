@@ -151,7 +151,8 @@ def doctor(
     bus: Annotated[
         str | None, typer.Option(help="CAN bus: virtual:NAME, udp:GROUP:PORT, socketcan:IFACE, slcan:DEVICE", show_default=BUS)
     ] = None,
-    fleet: Annotated[Path | None, typer.Option(help="fleet file; not with --bus; without it: module 1")] = None,
+    fleet: Annotated[Path | None, typer.Option(help="fleet file; not with --bus, --rate; without it: module 1")] = None,
+    rate_hz: Annotated[int | None, typer.Option("--rate", min=50, max=400, help="tick rate, Hz", show_default=f"{RATE_HZ}")] = None,
     out: Annotated[Path, typer.Option(parser=folder_of, metavar="DIR", help="folder for the logs")] = Path(),
     warm: Annotated[bool, typer.Option("--warm", help="only compile the functions that a tick calls into the cache")] = False,
 ) -> None:
@@ -162,7 +163,7 @@ def doctor(
     if warm:
         typer.echo(f"compiled code is there, after {warm_up():.1f} s")
         return
-    described = fleet_of(fleet, bus, None, None)
+    described = fleet_of(fleet, bus, None, rate_hz)
     raise typer.Exit(examine(described, out, say=lambda line: typer.echo(line)))
 
 

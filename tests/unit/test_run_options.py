@@ -4,8 +4,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from typer.testing import CliRunner
 
-from firmware_py.cli import fleet_of
+from firmware_py.app import doctor_report
+from firmware_py.cli import app, fleet_of
 
 FLEET = 'buses = ["virtual:options"]\n[[module]]\nnumber = 7\n'
 
@@ -22,6 +24,15 @@ def fleet(tmp_path: Path) -> Path:
 def test_bus_beside_a_fleet_file_is_refused(command: str, fleet: Path, refusal: Callable[..., str]) -> None:
     line = refusal(command, "--fleet", str(fleet), "--bus", "socketcan:can7")
     assert line == f"modcube: --bus beside --fleet: buses, vehicles and rate_hz stand in {fleet}; give one or the other"
+
+
+def test_doctor_judges_the_bus_at_the_rate_that_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Regression: without a fleet file it judged the load of 100 Hz, whatever rate the robot was to run at."""
+    rates: list[int] = []
+    monkeypatch.setattr(doctor_report, "examine", lambda fleet, folder, say: rates.append(fleet.rate_hz) or 0)
+    for arguments in ([], ["--rate", "400"]):
+        assert CliRunner().invoke(app, ["doctor", "--bus", "virtual:doctor", *arguments]).exit_code == 0
+    assert rates == [100, 400]
 
 
 @pytest.mark.slow
