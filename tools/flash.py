@@ -25,8 +25,8 @@ from typing import Any, NamedTuple
 
 from command_line import Parser, run_tool
 
-from flash_device import in_flight
 from flash_payload import Payload, PayloadError, make_payload
+from flash_service import in_flight
 from flash_ssh import LostError, UntouchedError, Vehicle, VehicleError
 
 UNPACKED = 4.0

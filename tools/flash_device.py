@@ -33,7 +33,9 @@ from flash_files import (
     RefusedError,
     UntouchedError,
     carry_compiled,
+    compilers,
     file_digest,
+    make_environment,
     remove,
     run,
     sync_folder,
@@ -42,19 +44,10 @@ from flash_files import (
     watches,
     write_whole,
 )
-from flash_units import GUARD, as_root, guard_unit, installed_units, release_units
+from flash_service import SERVICE, Service
+from flash_units import GUARD, guard_unit, release_units
 
-SERVICE = "modcube.service"
-UNIT_FOLDER = Path("/etc/systemd/system")
-HEALTHY_S = 5.0
-"""How long a new release must run healthily."""
-HEALTH_LIMIT_S = 60.0
-"""Timeout for becoming healthy."""
-POLL_S = 0.5
 KEPT_RELEASES = 3
-COMPILERS = ("numba", "llvmlite", "numpy")
-"""Distributions on which compiled code depends besides its sources."""
-STATUS_FIELDS = ("ActiveState", "SubState", "MainPID", "NRestarts", "StatusText")
 COMMANDS = ("missing", "install", "activate", "rollback", "boot", "status")
 LOCK_FREE_COMMANDS = ("boot", "status")
 """Commands that take no input, and never wait for another flash."""
@@ -82,7 +75,8 @@ class Device:
         self.root = root
         self.releases, self.wheels = root / "releases", root / "wheels"
         self.current, self.previous, self.trial = root / "current", root / "previous", root / "trial.json"
-        self._run, self._sleep, self._step = run, sleep, step
+        self._run, self._step = run, step
+        self.service = Service(root, run, sleep, step)
 
     def missing_wheels(self, wheels: dict[str, str]) -> list[str]:
         """Those of `wheels` (name -> SHA-256) that have to be shipped. Removes wheels with a wrong digest."""
@@ -108,7 +102,7 @@ class Device:
         self._step("clear")
         shutil.rmtree(partial, ignore_errors=True)
         shutil.rmtree(target, ignore_errors=True)
-        packages = self._make_environment(partial)
+        packages = make_environment(partial)
         for name in wheels:
             self._step(f"unpack {name}")
             unpack(self.wheels / name, packages)
@@ -123,31 +117,13 @@ class Device:
         partial.rename(target)
         sync_folder(self.releases)
 
-    def _make_environment(self, partial: Path) -> Path:
-        """Makes a virtual environment without pip, and the command; returns the folder for packages."""
-        version = f"{sys.version_info.major}.{sys.version_info.minor}"
-        packages = partial / "lib" / f"python{version}" / "site-packages"
-        packages.mkdir(parents=True)
-        (partial / "bin").mkdir()
-        interpreter = Path(sys.executable).resolve()
-        (partial / "bin" / "python").symlink_to(interpreter)
-        (partial / "pyvenv.cfg").write_text(f"home = {interpreter.parent}\nversion = {sys.version.split()[0]}\n")
-        command = partial / "bin" / "modcube"
-        # The release is renamed when it is complete, so nothing in it may contain its own path.
-        command.write_text(
-            '#!/bin/sh\nhere=$(dirname "$(readlink -f "$0")")\n'
-            'exec "$here/python" -I -c "from firmware_py.__main__ import main; main()" "$@"\n'
-        )
-        command.chmod(0o755)
-        return packages
-
     def _carry_over(self, wheels: dict[str, str], packages: Path) -> None:
         """Copies compiled code from the current release if everything it was built from is the same: saves minutes."""
         old = self.linked(self.current)
         if old is None:
             return
         before = json.loads((self.releases / old / "release.json").read_text())["wheels"]
-        if all(wheel_of_distribution(before, name) == wheel_of_distribution(wheels, name) for name in COMPILERS):
+        if compilers(before) == compilers(wheels):
             source = next((self.releases / old / "lib").glob("python*/site-packages"))
             if source.parent.name == packages.parent.name:
                 carry_compiled(source, packages)
@@ -162,21 +138,21 @@ class Device:
         if not (target / "release.json").is_file():
             raise RefusedError(f"there is no release {release}; there are {', '.join(self.names()) or 'none'}")
         self._roll_back_unwatched_trial()
-        self._install_units(guard_unit(self.root), GUARD)
+        self.service.install_units(guard_unit(self.root), GUARD)
         units = release_units(target, self.root)
         old = None if self.trial.exists() else self.linked(self.current)  # never one that is still on trial
         if old == release:
-            self._install_units(units, SERVICE)
-            self._start_and_wait(release)
+            self.service.install_units(units, SERVICE)
+            self.service.start_and_wait()
             return
         self._step("trial")
-        before = {"old": old, "previous": self.linked(self.previous), "units": installed_units(units, UNIT_FOLDER)}
+        before = {"old": old, "previous": self.linked(self.previous), "units": self.service.installed(units)}
         trial = {"release": release, **before, **watcher()}
         write_whole(self.trial, json.dumps(trial))
         try:
             self._switch(self.current, release)
-            self._install_units(units, SERVICE)
-            self._start_and_wait(release)
+            self.service.install_units(units, SERVICE)
+            self.service.start_and_wait()
             if old is not None:
                 self._switch(self.previous, old)
         except (RefusedError, OSError) as error:
@@ -191,7 +167,7 @@ class Device:
         self._roll_back_unwatched_trial()
         now, earlier = self.linked(self.current), self.linked(self.previous)
         if now is not None and now != tried:  # the current one was still on trial and is rolled back already
-            self._start_and_wait(now)
+            self.service.start_and_wait()
             return now
         if earlier is None:
             raise RefusedError("there is no earlier release to go back to")
@@ -205,8 +181,7 @@ class Device:
             return ""
         said = self._roll_back_unwatched_trial()
         if said:
-            with contextlib.suppress(RefusedError):  # needed if systemd refused the unit on trial: then nothing else starts the service
-                self._run([*as_root(), "systemctl", "--no-block", "restart", SERVICE])
+            self.service.start_without_waiting()  # needed if systemd refused the unit on trial: then nothing else starts the service
         return said
 
     def _on_trial(self) -> dict[str, Any] | None:
@@ -241,7 +216,7 @@ class Device:
                 remove(link)
             elif (self.releases / release / "release.json").is_file():
                 self._switch(link, release)
-        self._install_units(trial.get("units", {}), SERVICE)
+        self.service.install_units(trial.get("units", {}), SERVICE)
         self._step("end trial")
         remove(self.trial)
 
@@ -252,7 +227,7 @@ class Device:
             "previous": self.linked(self.previous),
             "trial": self.trial.exists(),
             "releases": self.names(),
-            "service": self.service(),
+            "service": self.service.state(),
         }
 
     def names(self) -> list[str]:
@@ -268,19 +243,6 @@ class Device:
             return None
         name = Path(os.readlink(link)).name
         return name if (self.releases / name / "release.json").is_file() else None
-
-    def service(self) -> dict[str, str]:
-        """State of the service as reported by systemd; empty when systemd does not answer."""
-        try:
-            text = self._run(["systemctl", "show", SERVICE, *(f"--property={field}" for field in STATUS_FIELDS)])
-        except RefusedError:
-            return {}
-        return dict(line.split("=", 1) for line in text.splitlines() if "=" in line)
-
-    def check_disarmed(self) -> None:
-        """Raises UntouchedError where the service controls an armed vehicle, or does not report that it is disarmed."""
-        if line := in_flight(self.service()):
-            raise UntouchedError(line)
 
     def prune(self) -> None:
         """Removes releases beyond KEPT_RELEASES, and wheels that no remaining release needs."""
@@ -305,52 +267,6 @@ class Device:
         os.replace(fresh, link)
         sync_folder(self.root)
 
-    def _install_units(self, units: dict[str, str], enabled: str) -> None:
-        """Installs `units` (name -> text) in systemd and enables the unit `enabled` at boot. Raises RefusedError."""
-        self._step("units")
-        there = installed_units(units, UNIT_FOLDER)
-        for name, text in units.items():
-            if there.get(name) != text:
-                self._install_unit(name, text)
-        if units:  # every time: an interrupted flash may have left only the files
-            self._run([*as_root(), "systemctl", "daemon-reload"])
-            self._run([*as_root(), "systemctl", "enable", "--quiet", enabled])
-
-    def _install_unit(self, name: str, text: str) -> None:
-        """Installs one unit atomically: after a power cut systemd's folder has the whole new text or the old one."""
-        rendered, fresh = self.root / f"{name}.new", str(UNIT_FOLDER / f"{name}.new")
-        write_whole(rendered, text)
-        self._run([*as_root(), "install", "-m", "644", str(rendered), fresh])
-        self._run([*as_root(), "sync", fresh])
-        self._run([*as_root(), "mv", "-T", fresh, str(UNIT_FOLDER / name)])
-        self._run([*as_root(), "sync", str(UNIT_FOLDER)])
-        rendered.unlink()
-
-    def _start_and_wait(self, release: str) -> None:
-        """Restarts the service and waits until it has run healthily for HEALTHY_S. Raises RefusedError."""
-        self._step("restart")
-        with contextlib.suppress(RefusedError):  # it may not be loaded yet
-            self._run([*as_root(), "systemctl", "reset-failed", SERVICE])
-        self._run([*as_root(), "systemctl", "restart", SERVICE])
-        first: dict[str, str] = {}
-        waited = well = 0.0
-        while waited < HEALTH_LIMIT_S:
-            self._step("health")
-            now = self.service()
-            if now.get("ActiveState") == "failed":
-                raise RefusedError("the service failed")
-            if first and (now.get("NRestarts"), now.get("MainPID")) != (first.get("NRestarts"), first.get("MainPID")):
-                raise RefusedError("the service ended and was started again")
-            if now.get("ActiveState") == "active" and ticks(now) is not None:
-                moves = first and ticks(now) != ticks(first)
-                first = first or now
-                well = well + POLL_S if moves else well
-                if well >= HEALTHY_S:
-                    return
-            self._sleep(POLL_S)
-            waited += POLL_S
-        raise RefusedError(f"no health report within {HEALTH_LIMIT_S:.0f} s")
-
     def _go_back(self, trial: dict[str, Any]) -> str:
         """Rolls back from an unhealthy release; returns what became of the service."""
         old = trial["old"]
@@ -359,41 +275,13 @@ class Device:
         except (RefusedError, OSError) as error:
             return f"not yet taken back: {error}; the service's next start tries again"
         if old is None:
-            with contextlib.suppress(RefusedError):
-                self._run([*as_root(), "systemctl", "stop", SERVICE])
+            self.service.stop()
             return "there was no earlier release; the service is stopped"
         try:
-            self._start_and_wait(old)
+            self.service.start_and_wait()
         except RefusedError as error:
             return f"rolled back to {old}, which is not healthy either: {error}"
         return f"rolled back to {old}, which runs"
-
-
-def ticks(status: dict[str, str]) -> int | None:
-    """The tick that the service last reported; None before its first report."""
-    tick = report(status).get("tick", "")
-    return int(tick) if tick.isdigit() else None
-
-
-def report(status: dict[str, str]) -> dict[str, str]:
-    """The KEY=VALUE words of the service's own report."""
-    return dict(word.split("=", 1) for word in status.get("StatusText", "").split() if "=" in word)
-
-
-def in_flight(status: dict[str, str]) -> str:
-    """Reason why the service may not be stopped now, in one line; empty if it may: not running, not ticking yet, or no module armed."""
-    if status.get("ActiveState") in ("inactive", "failed") or ticks(status) is None:
-        return ""
-    armed = report(status).get("armed", "")
-    if armed.startswith("0/"):
-        return ""
-    what = f"{armed} modules are armed" if armed else "its release does not say whether it is armed"
-    return f"{what}, and its service would be stopped: disarm it, or say --armed"
-
-
-def wheel_of_distribution(wheels: dict[str, str], name: str) -> str:
-    """The file name of a distribution's wheel; empty where there is none."""
-    return next((wheel for wheel in wheels if wheel.startswith(f"{name}-")), "")
 
 
 def parse(words: Sequence[str] | None) -> argparse.Namespace:
@@ -431,7 +319,7 @@ def main(words: Sequence[str] | None = None) -> int:
 def perform(device: Device, command: str, given: dict[str, Any]) -> object:
     """Runs one command. Raises RefusedError."""
     if command in REFUSED_WHILE_ARMED and not given.get("armed"):
-        device.check_disarmed()
+        device.service.check_disarmed()
     if command == "missing":
         return device.missing_wheels(given["wheels"])
     if command == "install":

@@ -9,8 +9,9 @@ import hashlib
 import os
 import shutil
 import subprocess
+import sys
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from firmware_py.compiled_code import cached_sources, transitive_sources
@@ -20,6 +21,8 @@ FILE_TIME_S = 315532800
 
 
 OWN_PACKAGES = ("firmware_py", "hil")
+COMPILERS = ("numba", "llvmlite", "numpy")
+"""Distributions on which compiled code depends besides its sources."""
 
 
 class RefusedError(Exception):
@@ -28,6 +31,25 @@ class RefusedError(Exception):
 
 class UntouchedError(RefusedError):
     """Refused before anything was begun: everything runs as before."""
+
+
+def make_environment(folder: Path) -> Path:
+    """Makes a virtual environment without pip, and the command; returns the folder for packages."""
+    version = f"{sys.version_info.major}.{sys.version_info.minor}"
+    packages = folder / "lib" / f"python{version}" / "site-packages"
+    packages.mkdir(parents=True)
+    (folder / "bin").mkdir()
+    interpreter = Path(sys.executable).resolve()
+    (folder / "bin" / "python").symlink_to(interpreter)
+    (folder / "pyvenv.cfg").write_text(f"home = {interpreter.parent}\nversion = {sys.version.split()[0]}\n")
+    command = folder / "bin" / "modcube"
+    # The release is renamed when it is complete, so nothing in it may contain its own path.
+    command.write_text(
+        '#!/bin/sh\nhere=$(dirname "$(readlink -f "$0")")\n'
+        'exec "$here/python" -I -c "from firmware_py.__main__ import main; main()" "$@"\n'
+    )
+    command.chmod(0o755)
+    return packages
 
 
 def unpack(wheel: Path, packages: Path) -> None:
@@ -47,6 +69,11 @@ def unpack(wheel: Path, packages: Path) -> None:
             with archive.open(name) as source, target.open("wb") as sink:
                 shutil.copyfileobj(source, sink)
             os.utime(target, (FILE_TIME_S, FILE_TIME_S))
+
+
+def compilers(wheels: Collection[str]) -> list[str]:
+    """Wheels, by file name, of the COMPILERS among `wheels`; empty text where there is none."""
+    return [next((wheel for wheel in wheels if wheel.startswith(f"{name}-")), "") for name in COMPILERS]
 
 
 def carry_compiled(old: Path, new: Path) -> bool:

@@ -19,7 +19,7 @@ OPTIONS = (
 TOOLS = Path(__file__).resolve().parent
 PACKAGE = TOOLS.parent / "firmware_py"
 DEVICE_FILES = {
-    **{name: TOOLS / name for name in ("flash_device.py", "flash_files.py", "flash_units.py", "command_line.py")},
+    **{name: TOOLS / name for name in ("flash_device.py", "flash_files.py", "flash_service.py", "flash_units.py", "command_line.py")},
     "firmware_py/compiled_code.py": PACKAGE / "compiled_code.py",
     "firmware_py/__init__.py": PACKAGE / "runtime" / "__init__.py",
 }

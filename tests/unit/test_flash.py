@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import flash
-import flash_device
 import flash_files
+import flash_service
 import flash_units
 import pytest
 from flash_payload import Payload
@@ -99,7 +99,7 @@ def test_release_is_installed_started_and_runs_its_own_code(put: Callable[..., i
     assert (fake / "restarts").read_text().count("restarted") == 1
     packages = next((fake / "root/current/lib").glob("python*/site-packages"))
     assert (packages / "extra.py").exists() and not list(packages.glob("**/left_out"))
-    assert sorted(path.name for path in (fake / "etc").iterdir()) == [flash_units.GUARD, flash_device.SERVICE]
+    assert sorted(path.name for path in (fake / "etc").iterdir()) == [flash_units.GUARD, flash_service.SERVICE]
     assert f"{fake}/root/flash/flash_device.py {fake}/root boot" in (fake / "etc" / flash_units.GUARD).read_text()
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 import flash_device
 import flash_files
+import flash_service
 import flash_units
 import pytest
 from flash_device import Device
@@ -78,7 +79,7 @@ class Machine:
 
     def units(self) -> dict[str, str]:
         """Unit texts by file name in systemd's folder."""
-        return {path.name: path.read_text() for path in flash_device.UNIT_FOLDER.glob("*.service")}
+        return {path.name: path.read_text() for path in flash_service.UNIT_FOLDER.glob("*.service")}
 
     def device(self) -> Device:
         return Device(self.root, self.run, sleep=lambda seconds: None, step=self.step)
@@ -98,7 +99,7 @@ def etc(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Systemd's folder of the vehicle in this process."""
     folder = tmp_path / "systemd"
     folder.mkdir()
-    monkeypatch.setattr(flash_device, "UNIT_FOLDER", folder)
+    monkeypatch.setattr(flash_service, "UNIT_FOLDER", folder)
     return folder
 
 
@@ -135,7 +136,7 @@ def test_power_cut_at_any_step_brings_a_release_up_that_runs(tmp_path: Path, mon
         assert "broken" not in confirmed
         assert confirmed == GOOD or machine.steps[-1] == "prune", machine.steps[-1]
         assert device.linked(device.previous) != confirmed, machine.steps[-1]
-        assert again.loaded[flash_device.SERVICE] == unit_of(confirmed), machine.steps[-1]
+        assert again.loaded[flash_service.SERVICE] == unit_of(confirmed), machine.steps[-1]
         assert not device.trial.exists()
         if confirmed != GOOD:
             device.activate(GOOD)
@@ -154,7 +155,7 @@ def test_power_cut_at_any_step_of_going_back_is_made_good_by_the_next_boot(tmp_p
             break
         again = boot_again(tmp_path, monkeypatch)
         assert current(tmp_path, ".") == GOOD and not again.device().trial.exists()
-        assert again.loaded[flash_device.SERVICE] == unit_of(GOOD), machine.steps[-1]
+        assert again.loaded[flash_service.SERVICE] == unit_of(GOOD), machine.steps[-1]
     assert cut >= 8
 
 
@@ -163,8 +164,8 @@ def test_first_flash_cut_at_any_step_is_made_whole_by_the_second(tmp_path: Path,
     """A unit file left by the cut flash, which systemd has neither read nor enabled, does not stop the second flash from doing both."""
     for cut in range(200):
         root = tmp_path / str(cut)
-        monkeypatch.setattr(flash_device, "UNIT_FOLDER", root / "systemd")
-        flash_device.UNIT_FOLDER.mkdir(parents=True)
+        monkeypatch.setattr(flash_service, "UNIT_FOLDER", root / "systemd")
+        flash_service.UNIT_FOLDER.mkdir(parents=True)
         machine = Machine(root)
         machine.left = cut
         try:
@@ -174,8 +175,8 @@ def test_first_flash_cut_at_any_step_is_made_whole_by_the_second(tmp_path: Path,
             again = boot_again(root, monkeypatch)
         again.enabled = machine.enabled
         again.install_and_activate(GOOD)
-        assert again.enabled == {flash_units.GUARD, flash_device.SERVICE}, machine.steps[-1]
-        assert again.loaded == again.units() and again.loaded[flash_device.SERVICE] == unit_of(GOOD), machine.steps[-1]
+        assert again.enabled == {flash_units.GUARD, flash_service.SERVICE}, machine.steps[-1]
+        assert again.loaded == again.units() and again.loaded[flash_service.SERVICE] == unit_of(GOOD), machine.steps[-1]
     assert cut >= 25
 
 
@@ -206,7 +207,7 @@ def test_release_whose_watcher_died_is_never_what_the_next_flash_goes_back_to(tm
     with pytest.raises(RefusedError, match=f"rolled back to {GOOD}, which runs"):
         machine.install_and_activate(release)
     assert current(tmp_path, ".") == GOOD
-    assert machine.loaded[flash_device.SERVICE] == unit_of(GOOD)
+    assert machine.loaded[flash_service.SERVICE] == unit_of(GOOD)
 
 
 def test_first_release_whose_watcher_died_is_not_taken_for_a_proven_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,7 +228,7 @@ def test_roll_back_of_a_release_whose_watcher_died_leads_to_the_one_before(tmp_p
     machine = Machine(tmp_path)
     assert machine.device().roll_back() == GOOD
     assert current(tmp_path, ".") == GOOD and not machine.device().trial.exists()
-    assert machine.loaded[flash_device.SERVICE] == unit_of(GOOD) and "restart" in machine.steps
+    assert machine.loaded[flash_service.SERVICE] == unit_of(GOOD) and "restart" in machine.steps
 
 
 def test_disk_that_fills_up_after_the_switch_takes_the_release_back(tmp_path: Path) -> None:
@@ -237,7 +238,7 @@ def test_disk_that_fills_up_after_the_switch_takes_the_release_back(tmp_path: Pa
     with pytest.raises(RefusedError, match=f"No space left on device; rolled back to {GOOD}, which runs"):
         machine.install_and_activate(BETTER)
     assert current(tmp_path, ".") == GOOD and not machine.device().trial.exists()
-    assert machine.units()[flash_device.SERVICE] == unit_of(GOOD)
+    assert machine.units()[flash_service.SERVICE] == unit_of(GOOD)
 
 
 def test_service_that_starts_while_its_release_is_watched_is_left_alone(tmp_path: Path) -> None:
@@ -308,12 +309,12 @@ def test_vehicle_that_was_armed_since_flash_looked_is_left_alone(tmp_path: Path,
 def test_service_that_has_ended_is_not_armed_whatever_it_said_last(tmp_path: Path, state: str) -> None:
     machine = Machine(tmp_path)
     machine.says, machine.active = "armed=1/1", state
-    machine.device().check_disarmed()
+    machine.device().service.check_disarmed()
 
 
 def test_service_that_ticks_not_yet_can_be_replaced(tmp_path: Path) -> None:
     """systemd clears the status report at every start, so a release that never reaches a tick has none."""
-    assert flash_device.in_flight({"ActiveState": "activating", "StatusText": ""}) == ""
+    assert flash_service.in_flight({"ActiveState": "activating", "StatusText": ""}) == ""
 
 
 @pytest.mark.parametrize(("words", "status"), [(["--help"], 0), ([], 2), (["root"], 2), (["root", "fly"], 2)])
