@@ -33,7 +33,7 @@ from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.files import FileWriter
 from firmware_py.ground.link import Links
 from firmware_py.ground.link_address import LinkError
-from firmware_py.ground.mission_flight import Plan, PlanJob
+from firmware_py.ground.plan_jobs import Plan, PlanJob
 from firmware_py.ground.signing import FILE_MODE, Signing, load_signing
 from firmware_py.ground.station import GroundStation
 from firmware_py.ground.system import STOPPING

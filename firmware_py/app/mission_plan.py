@@ -10,8 +10,8 @@ import numpy as np
 from firmware_py.core.body import Body
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import Setpoint
-from firmware_py.ground.mission_flight import Plan, PlanJob
 from firmware_py.ground.mission_legs import GO_TO, Leg
+from firmware_py.ground.plan_jobs import Plan, PlanJob
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, distinct, fastest, plan
 from firmware_py.prepare.piecewise import Piecewise
 from firmware_py.prepare.snap_timing import MOVED_M

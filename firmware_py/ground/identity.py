@@ -36,7 +36,7 @@ class Identity:
         autopilot: MAV_AUTOPILOT.
         numbers: custom modes that stand for each mode; the first is reported.
         pairs: the second and third parameter of DO_SET_MODE are a main and a sub mode, as in PX4.
-        mission_has_home: item 0 of a mission is the home position and is not flown, as in ArduPilot.
+        first_item: number of the first mission item that is flown. Item 0 is the home position in ArduPilot.
         waypoints_turn: a place in a mission, or to go to, may have a heading. ArduSub ignores it; its clients write 0, which is north.
         first_log: number of the oldest log. QGroundControl counts from 1 for ArduPilot alone.
         first_motor: number of the first motor in a motor test. ArduSub and its test clients count from 0.
@@ -47,7 +47,7 @@ class Identity:
     autopilot: int
     numbers: Mapping[Mode, tuple[int, ...]]
     pairs: bool
-    mission_has_home: bool
+    first_item: int
     waypoints_turn: bool
     first_log: int
     first_motor: int
@@ -94,7 +94,7 @@ GENERIC = Identity(
         Mode.MOTOR_DETECT: (px4(4, 1),),  # ready
     },
     pairs=True,
-    mission_has_home=False,
+    first_item=0,
     waypoints_turn=True,
     first_log=0,
     first_motor=1,
@@ -106,7 +106,7 @@ ARDUSUB = Identity(
     autopilot=AUTOPILOT_ARDUPILOT,
     numbers={mode: (int(mode),) for mode in Mode},
     pairs=False,
-    mission_has_home=True,
+    first_item=1,
     waypoints_turn=False,
     first_log=1,
     first_motor=0,

@@ -8,26 +8,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from itertools import takewhile
-from typing import Any, NamedTuple
 
-import numpy as np
-
-from firmware_py.core.setpoint import Trajectory
 from firmware_py.core.types import INFORMATION, NOTICE, WARNING, Action, Event, Mode
 from firmware_py.description.parameters import Parameters
-from firmware_py.ground.mission_items import (
-    FASTEST,
-    LOITER_UNLIMITED,
-    SLOWEST,
-    SPEED_DEFAULT,
-    SPEED_STAYS,
-    Item,
-    MissionError,
-    beyond_fence,
-    flight_order,
-)
-from firmware_py.ground.mission_legs import GO_TO, Flight, Leg
+from firmware_py.ground.mission_items import FASTEST, SLOWEST, SPEED_DEFAULT, SPEED_STAYS, Item, MissionError, beyond_fence
+from firmware_py.ground.mission_legs import GO_TO, Flight, Leg, at_another_speed, legs_from
+from firmware_py.ground.plan_jobs import Plan, PlanJobs
+from firmware_py.ground.reached_items import ReachedItems
 from firmware_py.ground.system import NS_PER_S, System
 from firmware_py.ground.telemetry import ACTIVE, DONE, NO_MISSION, PAUSED, READY, mission_current
 
@@ -35,34 +22,11 @@ _SETTLE_TICKS = 3
 """Ticks from the request of a hold to reading where the body is held."""
 _HOLD_TICKS = 100
 """Ticks from the request of a hold until it must be in force; ticks queued while the loop took the request count too."""
-_REACHED_REPEATS, _REACHED_EVERY_NS = 3, 300_000_000
 _LATE_FOR_HOLD_S = 1.0
 """Delay beyond which a body that comes to its hold has the rest of the mission planned anew from there, the hold first."""
 _ANOTHER = "the body is another one"
 _PRESENT = -1
 """DO_SET_MISSION_CURRENT's number for the current item."""
-
-
-class PlanJob(NamedTuple):
-    """A flight to be planned."""
-
-    body: int
-    serial: int
-    p_wb: np.ndarray
-    q_wb: np.ndarray
-    legs: tuple[Leg, ...]
-    acceleration: float
-    corridor_m: float
-
-
-class Plan(NamedTuple):
-    """A planned flight; `arrivals_s` are the times from its start at which the legs' places are to be reached."""
-
-    serial: int
-    trajectory: Trajectory | None
-    arrivals_s: tuple[float, ...]
-    reason: str = ""
-    """Why there is no trajectory."""
 
 
 class MissionFlight:
@@ -71,18 +35,13 @@ class MissionFlight:
     def __init__(self, system: System, parameters: Callable[[], Parameters]) -> None:
         self._system, self._parameters = system, parameters
         self.items: tuple[Item, ...] = ()
-        self.jobs: list[PlanJob] = []
-        """Flights to be planned; the planner takes them."""
-        self._jobs_so_far = 0
+        self.jobs = PlanJobs(parameters)
         self._flight: Flight | None = None
         self._remaining_legs: tuple[Leg, ...] = ()
         """Legs left of a paused mission: jumps already made are not repeated."""
         self._started_at_item: int | None = None
         """Item from which the mission was last started; None while a jump restarts it, perhaps from the same item."""
-        self._speed: float | None = None
-        self._repeat: list[tuple[int, int]] = []
-        """Number and time of each repeat of MISSION_ITEM_REACHED that is due. Only the newest item is repeated: MAVSDK takes the one that
-        it heard of last for the farthest."""
+        self._reached = ReachedItems(system)
 
     # ------------------------------------------------------------ requests
 
@@ -91,7 +50,7 @@ class MissionFlight:
         if self._flight is not None and self._flight.of_mission and not self._flight.arrivals_s:
             self._end_before_it_began("its mission was replaced")
         self.amend(items)
-        self._repeat = []  # a client would take them for items of the new mission
+        self._reached.forget()
         p = self._system.subject.progress
         p.total, p.current = max(len(items) - self._first, 0), min(self._first, max(len(items) - 1, 0))
         p.state = READY if items else NO_MISSION
@@ -140,12 +99,12 @@ class MissionFlight:
             return ""
         left = self._remaining_legs if first is None and s.progress.state == PAUSED else ()
         try:
-            legs = left or self._legs(wanted)
+            legs = left or legs_from(self.items, wanted, s.origin, s.identity)
         except MissionError as error:
             return str(error)
         if not legs:
             return "nothing is left to fly"
-        self._repeat = [repeat for repeat in self._repeat if repeat[0] < legs[0].sequence]
+        self._reached.forget(legs[0].sequence)
         s.progress.state, s.progress.current, self._started_at_item = ACTIVE, legs[0].sequence, wanted
         if not self._flies_already(legs):
             self._begin(legs)
@@ -184,12 +143,12 @@ class MissionFlight:
         if wanted is not None and not SLOWEST <= wanted <= FASTEST:
             return _no_speed(wanted)
         self._end_if_taken()
-        self._speed, self._remaining_legs = wanted, _at_another_speed(self._remaining_legs)
+        self.jobs.speed_m_s, self._remaining_legs = wanted, at_another_speed(self._remaining_legs)
         flight = self._flight
         if flight is not None and self._is_on_its_way(flight):
-            legs = _at_another_speed(flight.left(self._flown_s(flight)))
-            if self._plan_inputs(legs)[-len(legs) :] != flight.plan_inputs[-len(legs) :]:
-                self._system.say(NOTICE, f"{self._cruise:g} m/s: the way from here is planned anew")
+            legs = at_another_speed(flight.left(self._flown_s(flight)))
+            if self.jobs.inputs(legs)[-len(legs) :] != flight.plan_inputs[-len(legs) :]:
+                self._system.say(NOTICE, f"{self.jobs.cruise_m_s:g} m/s: the way from here is planned anew")
                 self._begin(legs, flight.replaced)
         return ""
 
@@ -253,7 +212,7 @@ class MissionFlight:
                 self._advance(flight, time_ns)
             elif flight.started_ns is not None:
                 self._end(PAUSED)
-        self._tell_again(time_ns)
+        self._reached.tell_again(time_ns)
 
     def _end_if_taken(self) -> None:
         """Ends a flight that has not begun if the body no longer waits for it."""
@@ -290,27 +249,15 @@ class MissionFlight:
         flight, s = self._flight, self._system.subject
         if flight is None or flight.serial or not flight.hold_reached or s.picture.ticks < flight.begun_tick + _SETTLE_TICKS:
             return
-        self._jobs_so_far += 1
-        flight.serial, flight.plan_inputs = self._jobs_so_far, self._plan_inputs(flight.legs)
-        at, ground, legs = s.record.setpoint, self._parameters().ground, self._with_speeds(flight.legs)
-        self.jobs.append(PlanJob(s.body, flight.serial, at.p_wb, at.q_wb, legs, ground.mission_acceleration, ground.mission_corridor_m))
-
-    def _with_speeds(self, legs: Sequence[Leg]) -> tuple[Leg, ...]:
-        cruise = self._cruise
-        return tuple(leg._replace(speed_m_s=cruise) if math.isnan(leg.speed_m_s) else leg for leg in legs)
-
-    def _plan_inputs(self, legs: Sequence[Leg]) -> tuple[Any, ...]:
-        ground = self._parameters().ground
-        places = (None if leg.p_wb is None else tuple(leg.p_wb) for leg in legs)
-        rest = (leg._replace(p_wb=None) for leg in self._with_speeds(legs))
-        return ground.mission_acceleration, ground.mission_corridor_m, *places, *rest
+        flight.plan_inputs = self.jobs.inputs(flight.legs)
+        flight.serial = self.jobs.add(s.body, s.record.setpoint, flight.legs)
 
     def _flies_already(self, legs: Sequence[Leg]) -> bool:
         """Whether exactly these legs are under way and none is reached: a client repeats its request if the answer was lost."""
         flight = self._flight
         if flight is None or flight.replaced or flight.reached or flight.task_changes != self._system.task_changes:
             return False
-        return flight.plan_inputs == self._plan_inputs(legs)
+        return flight.plan_inputs == self.jobs.inputs(legs)
 
     def _advance(self, flight: Flight, time_ns: int) -> None:
         assert flight.started_ns is not None
@@ -342,8 +289,7 @@ class MissionFlight:
     def _tell_reached(self, flight: Flight, sequence: int, time_ns: int) -> None:
         if sequence == GO_TO or flight.replaced:
             return
-        self._system.broadcast("MISSION_ITEM_REACHED", {"seq": sequence})
-        self._repeat = [(sequence, time_ns + n * _REACHED_EVERY_NS) for n in range(1, _REACHED_REPEATS)]
+        self._reached.tell(sequence, time_ns)
         if flight.reached < len(flight.legs):
             self._system.subject.progress.current = flight.legs[flight.reached].sequence
 
@@ -354,20 +300,16 @@ class MissionFlight:
             where = "its pose is unknown" if math.isnan(away_m) else f"{away_m:.2f} m from its place"
             self._system.say(WARNING, f"{what} is late: {where}")
 
-    def _tell_again(self, time_ns: int) -> None:
-        while self._repeat and self._repeat[0][1] <= time_ns:
-            self._system.broadcast("MISSION_ITEM_REACHED", {"seq": self._repeat.pop(0)[0]})
-
     def _begin(self, legs: Sequence[Leg], replaced: bool = False) -> None:
         s = self._system.subject
         self._system.ask(Action.SET_MODE, Mode.POSHOLD)
         changes, members = self._system.task_changes, s.picture.members(s.body)
-        inputs, tick = self._plan_inputs(legs), s.picture.ticks
+        inputs, tick = self.jobs.inputs(legs), s.picture.ticks
         self._flight = Flight(tuple(legs), inputs, tick, task_changes=changes, members=members, replaced=replaced)
 
     def _end(self, state: int) -> None:
         flight, self._flight = self._flight, None
-        self.jobs.clear()
+        self.jobs.waiting.clear()
         if flight is not None and flight.of_mission and not flight.replaced:
             s = self._system.subject
             self._remaining_legs, s.progress.state = flight.left(self._flown_s(flight)), state
@@ -388,37 +330,7 @@ class MissionFlight:
 
     @property
     def _first(self) -> int:
-        return 1 if self._system.subject.identity.mission_has_home else 0
-
-    @property
-    def _cruise(self) -> float:
-        return self._parameters().ground.mission_speed_m_s if self._speed is None else self._speed
-
-    def _legs(self, first: int) -> tuple[Leg, ...]:
-        origin, turns, speed = self._system.subject.origin, self._system.subject.identity.waypoints_turn, math.nan
-        legs: list[Leg] = []
-        speeds = [item for item in self.items[:first] if item.speed_m_s is not None]  # speeds set by passed items stay in force
-        for item in (*speeds, *flight_order(self.items, first)):
-            if item.sequence < self._first:
-                continue  # home, the target of a jump
-            if item.speed_m_s is not None:
-                speed = item.speed_m_s if item.speed_m_s > 0 else math.nan
-            place = item.place(origin)
-            if place is not None:
-                legs.append(Leg(item.sequence, place, item.yaw if turns else None, item.hold_s, speed, item.acceptance_m))
-            elif item.delay_s > 0:
-                last = legs.pop() if legs else Leg(item.sequence, None, None, 0.0, speed)
-                legs.append(last._replace(hold_s=last.hold_s + item.delay_s))
-            if item.command == LOITER_UNLIMITED:
-                break
-        return tuple(legs)
-
-
-def _at_another_speed(legs: Sequence[Leg]) -> tuple[Leg, ...]:
-    """The legs with the speed that was set last, up to the next change of speed among them."""
-    alike = list(takewhile(lambda leg: np.array_equal(leg.speed_m_s, legs[0].speed_m_s, equal_nan=True), legs))
-    return (*(leg._replace(speed_m_s=math.nan) for leg in alike), *legs[len(alike) :])
-
+        return self._system.subject.identity.first_item
 
 def _no_speed(speed_m_s: float) -> str:
     return f"a speed of {speed_m_s:g} m/s; it needs {SLOWEST:g} to {FASTEST:g}"

@@ -1,14 +1,18 @@
-"""Legs of a flight, and how many of them the body has reached. MissionFlight follows the body along them."""
+"""Legs of a flight, made from mission items, and how many of them the body has reached. MissionFlight follows the body along them."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from firmware_py.ground.mission_items import ACCEPTANCE_M
+from firmware_py.ground.geodesy import Origin
+from firmware_py.ground.identity import Identity
+from firmware_py.ground.mission_items import ACCEPTANCE_M, LOITER_UNLIMITED, Item, flight_order
 
 GO_TO = -1
 """Sequence number of a leg that belongs to no mission."""
@@ -89,3 +93,30 @@ class Flight:
         if is_late:
             self.late_s = math.inf
         return is_late
+
+
+def legs_from(items: Sequence[Item], first: int, origin: Origin, identity: Identity) -> tuple[Leg, ...]:
+    """Returns the legs of a mission from item `first` on. Raises MissionError."""
+    turns, speed = identity.waypoints_turn, math.nan
+    legs: list[Leg] = []
+    speeds = [item for item in items[:first] if item.speed_m_s is not None]  # speeds set by passed items stay in force
+    for item in (*speeds, *flight_order(items, first)):
+        if item.sequence < identity.first_item:
+            continue  # home, the target of a jump
+        if item.speed_m_s is not None:
+            speed = item.speed_m_s if item.speed_m_s > 0 else math.nan
+        place = item.place(origin)
+        if place is not None:
+            legs.append(Leg(item.sequence, place, item.yaw if turns else None, item.hold_s, speed, item.acceptance_m))
+        elif item.delay_s > 0:
+            last = legs.pop() if legs else Leg(item.sequence, None, None, 0.0, speed)
+            legs.append(last._replace(hold_s=last.hold_s + item.delay_s))
+        if item.command == LOITER_UNLIMITED:
+            break
+    return tuple(legs)
+
+
+def at_another_speed(legs: Sequence[Leg]) -> tuple[Leg, ...]:
+    """Returns the legs with the speed that was set last, up to the next change of speed among them."""
+    alike = list(takewhile(lambda leg: np.array_equal(leg.speed_m_s, legs[0].speed_m_s, equal_nan=True), legs))
+    return (*(leg._replace(speed_m_s=math.nan) for leg in alike), *legs[len(alike) :])

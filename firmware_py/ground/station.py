@@ -19,12 +19,13 @@ from firmware_py.ground.geodesy import Origin
 from firmware_py.ground.identity import COMPONENT_AUTOPILOT
 from firmware_py.ground.logs import LogService
 from firmware_py.ground.message_requests import MessageRequests
-from firmware_py.ground.mission_flight import MissionFlight, Plan, PlanJob
+from firmware_py.ground.mission_flight import MissionFlight
 from firmware_py.ground.missions import MissionService
 from firmware_py.ground.outbox import Outbox, Outgoing
 from firmware_py.ground.parameters import ParameterService, ParameterStore
 from firmware_py.ground.picture import Picture
 from firmware_py.ground.pilots import Sender
+from firmware_py.ground.plan_jobs import Plan, PlanJob
 from firmware_py.ground.presence import Presence, Watch
 from firmware_py.ground.signing import Signing
 from firmware_py.ground.steering import Steering
@@ -222,8 +223,8 @@ class GroundStation:
         """Returns the planning jobs added since the last call."""
         jobs: list[PlanJob] = []
         for services in self.services.values():
-            jobs += services.flight.jobs
-            services.flight.jobs.clear()
+            jobs += services.flight.jobs.waiting
+            services.flight.jobs.waiting.clear()
         return jobs
 
     def awaited(self) -> list[int]:

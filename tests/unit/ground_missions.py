@@ -3,7 +3,7 @@
 import numpy as np
 
 from firmware_py.core.types import Setpoint
-from firmware_py.ground.mission_flight import Plan, PlanJob
+from firmware_py.ground.plan_jobs import Plan, PlanJob
 from tests.unit.ground_requests import NAN
 from tests.unit.ground_world import Client, World
 

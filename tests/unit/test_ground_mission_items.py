@@ -8,8 +8,8 @@ from pymavlink.dialects.v20 import all as mavlink
 
 from firmware_py.app.mission_plan import plan_mission
 from firmware_py.ground.config import GroundConfig
-from firmware_py.ground.mission_flight import PlanJob
 from firmware_py.ground.mission_legs import Leg
+from firmware_py.ground.plan_jobs import PlanJob
 from tests.unit.ground_missions import PLACES, begin, fly, item, upload
 from tests.unit.ground_requests import NAN
 from tests.unit.ground_world import Client, World

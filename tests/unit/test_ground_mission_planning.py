@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from firmware_py.app.mission_plan import plan_mission
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, Mode
-from firmware_py.ground.mission_flight import Plan, PlanJob
+from firmware_py.ground.plan_jobs import Plan, PlanJob
 from tests.unit.ground_missions import PLACES, begin, continued, go_to, item, plan_of, upload
 from tests.unit.ground_world import Client, World
 

@@ -9,7 +9,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from firmware_py.core.types import Mode
 from firmware_py.ground.config import GroundConfig
 from firmware_py.ground.geodesy import Origin
-from firmware_py.ground.mission_flight import PlanJob
+from firmware_py.ground.plan_jobs import PlanJob
 from tests.unit.ground_missions import PLACES, fly, item, plan_of, upload
 from tests.unit.ground_requests import NAN, ask
 from tests.unit.ground_world import Client, World

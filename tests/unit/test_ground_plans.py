@@ -15,8 +15,8 @@ import pytest
 
 from firmware_py.app.ground_station import _WARM_UP_JOB, GroundSide
 from firmware_py.ground.config import GroundConfig
-from firmware_py.ground.mission_flight import Plan, PlanJob
 from firmware_py.ground.mission_legs import Leg
+from firmware_py.ground.plan_jobs import Plan, PlanJob
 from tests.unit.ground_sides import PATIENCE_S, firmware_of, free_port, side_on
 
 
@@ -30,7 +30,7 @@ def test_planning_process_that_was_killed_is_replaced_and_no_station_is_lost_by_
         monkeypatch.setattr(side.station, "planned", lambda body, plan: plans.put(plan))
         side._executor = killed
         for _ in range(2):  # the second job meets the new executor
-            side.station.services[1].flight.jobs.append(_WARM_UP_JOB)
+            side.station.services[1].flight.jobs.waiting.append(_WARM_UP_JOB)
             side.pump()
         wait([future for _, future in side._plans], PATIENCE_S)
         side.pump()
@@ -50,10 +50,10 @@ def test_plans_that_nobody_waits_for_any_more_are_not_made(monkeypatch: pytest.M
     firmware = firmware_of(2)
     config = GroundConfig(links=(f"udpin:127.0.0.1:{free_port()}",))
     with ThreadPoolExecutor(1) as executor, closing(GroundSide(config, firmware, executor)) as side:
-        side.station.services[2].flight.jobs.append(_WARM_UP_JOB._replace(body=1))
+        side.station.services[2].flight.jobs.waiting.append(_WARM_UP_JOB._replace(body=1))
         side.pump()
         for serial in range(100):
-            side.station.services[1].flight.jobs.append(_WARM_UP_JOB._replace(serial=serial))
+            side.station.services[1].flight.jobs.waiting.append(_WARM_UP_JOB._replace(serial=serial))
             side.pump()
         may_end.set()
         wait([future for _, future in side._plans], PATIENCE_S)
@@ -70,7 +70,7 @@ def test_planning_process_ends_a_plan_that_its_body_does_not_wait_for_any_more(m
         monkeypatch.setattr(side.station, "planned", lambda body, plan: plans.append(plan))
         for serial in (1, 2):
             monkeypatch.setattr(side.station, "awaited", lambda serial=serial: [serial])
-            side.station.services[1].flight.jobs.append(_WARM_UP_JOB._replace(serial=serial, legs=(leg,)))
+            side.station.services[1].flight.jobs.waiting.append(_WARM_UP_JOB._replace(serial=serial, legs=(leg,)))
             side.pump()
         wait([future for _, future in side._plans])
         side.pump()

@@ -18,8 +18,8 @@ from firmware_py.core.setpoint import Trajectory
 from firmware_py.core.types import Estimate
 from firmware_py.description.parameters import Allocation, Control
 from firmware_py.description.vehicle import load_vehicle
-from firmware_py.ground.mission_flight import Plan, PlanJob
 from firmware_py.ground.mission_legs import Leg
+from firmware_py.ground.plan_jobs import Plan, PlanJob
 from firmware_py.prepare import snap_thrust
 from firmware_py.prepare.assembly import assemble_vehicle
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, plan
