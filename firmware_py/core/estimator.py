@@ -15,20 +15,20 @@ velocity estimate therefore follows the robot rather than the command, which gai
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
 from firmware_py.core import observation
 from firmware_py.core.alignment import AGREE_RAD, TagAgreement, tilt_between, upright
-from firmware_py.core.body import CRUISE_M_S, Body
+from firmware_py.core.body import Body
 from firmware_py.core.depth_gate import MOST_STEP_M
 from firmware_py.core.history import WINDOW_NS, History
+from firmware_py.core.kalman_filter import INITIAL_SIGMA, Belief, KalmanFilter
 from firmware_py.core.measurements import FLIP_RAD
 from firmware_py.core.propagation import ERRORS, STATES, Error, Nominal
 from firmware_py.core.rigid_body import restoring_moment
-from firmware_py.core.rotations import heading, multiply, rotate, to_matrix
-from firmware_py.core.topology import Motion, down_of
+from firmware_py.core.rotations import heading, multiply, to_matrix
+from firmware_py.core.topology import Motion
 from firmware_py.core.types import NEVER_NS, BodyPose, Estimate, ExpectedDepth, Measured
 from firmware_py.description.parameters import Estimation
 
@@ -49,16 +49,8 @@ CATCH_UP = 4
 ADRIFT_NS = 10_000_000_000
 """Time without a tag after which the velocity over ground counts as unknown. The accelerometer cannot tell a disturbance force from drag:
 the velocity estimate would grow, to 15 m/s within a minute of half stick, and spoil the tilt."""
-STILL_DENSITY = 0.0003
-"""Noise density of the zero-velocity pseudo-measurement that is fused while adrift, m^2/s: 0.17 m/s in a tick at 100 Hz."""
-NORTH_DENSITY = 1e-4
-"""Noise density of the heading pseudo-measurement before the first tag, rad^2 s. Until then the believed heading defines north, so it is
-known by definition. Without this the filter fitted the heading to noise: a bump turned the estimate by a third of a circle."""
 KEPT_STATES = np.r_[Nominal.RATE, Nominal.GYRO_BIAS, Nominal.ACCEL_BIAS, Nominal.VERTICAL_FORCE, Nominal.MOMENT, Nominal.RIGHTING]
 """Indices of what survives in the state when tags relocate a body that was adrift, because it does not depend on the heading."""
-UNDER_WAY_S = 0.01
-"""Sample period for which `accel_under_way` gives the error of one sample. A wrong mass causes the same error in all samples within that
-time, so that more samples carry no more information."""
 LEARNT, LEARNT_ERRORS, LEARNT_SIGMAS = np.r_[Nominal.MOMENT, Nominal.RIGHTING], np.r_[Error.MOMENT, Error.RIGHTING], 5.0
 """Indices of moment and righting vector in the state and in the error, and the limit in initial sigmas within which they are kept when the
 filter restarts because it refused too many tags. A wrong position does not spoil them; but a value outside the limit may be the very reason
@@ -70,17 +62,6 @@ NO_ACCEL_LIMIT_NS = 2_000_000_000
 `imu_lost`."""
 RESET_AFTER = 30
 """Consecutive refused observations (half a second) after which the filter restarts from the tag."""
-INITIAL_SIGMA = (0.02, 0.05, 0.2, 0.3, 0.02, 0.1, 0.1, 0.3, 0.1)
-"""Initial sigma of position m, attitude rad, velocity m/s, rate rad/s, gyro bias, accelerometer bias, disturbance force over mass,
-disturbance moment over inertia, depth bias."""
-
-
-class Belief(NamedTuple):
-    """State (32,) and covariance (28, 28) at a time, in the order of core.propagation."""
-
-    x: np.ndarray
-    covariance: np.ndarray
-    time_ns: int
 
 
 class Estimator:
@@ -88,9 +69,9 @@ class Estimator:
 
     def __init__(self, body: Body, parameters: Estimation, period_ns: int) -> None:
         self._body = body
-        self._plant = body.plant
         self._dt = period_ns * 1e-9
         self._history = History(period_ns)
+        self._filter = KalmanFilter(body, parameters, self._history)
         self._now = NOWHERE
         """State at the time of the last tick; without an estimate the last believed pose, at rest."""
         self._anchor: Belief
@@ -113,14 +94,8 @@ class Estimator:
 
     def retune(self, parameters: Estimation) -> None:
         """Applies new noise parameters from the next tick on; the estimate stays."""
-        p = self._p = parameters
-        self._density = self._process_noise()
-        drag_walk = p.current_walk * self._body.drag.cruise_slope / CRUISE_M_S
-        reach_m = self._body.reach_m
-        accel = p.accel_under_way * math.sqrt(UNDER_WAY_S / self._dt)
-        self._under_way = np.array([drag_walk, drag_walk * reach_m, p.alpha_turning, accel, accel * reach_m])
-        self._inertial_sigma = np.array([p.gyro_sigma, p.accel_sigma, p.depth_sigma_m])
-        self._tag_variance = np.repeat([p.tag_sigma_m, p.tag_sigma_axis_m, p.tag_sigma_rad], [2, 1, 3]) ** 2
+        self._p = parameters
+        self._filter.retune(parameters)
 
     @property
     def q_wb(self) -> np.ndarray:
@@ -159,10 +134,10 @@ class Estimator:
         if not self._accepted:
             self._wait(time_ns)
         if self._accepted:
-            self._anchor = self._advanced(self._anchor, time_ns - WINDOW_NS)
+            self._anchor = self._filter.advanced(self._anchor, time_ns - WINDOW_NS)
             self._move_head(time_ns)
             if self._is_adrift:
-                self._anchor, self._head = self._stilled(self._anchor), self._stilled(self._head)
+                self._stand_still()
         return self._estimate(time_ns)
 
     @property
@@ -190,7 +165,7 @@ class Estimator:
         elif not self._accepted:
             self._start(pose)
         elif pose.capture_ns >= self._anchor.time_ns:
-            self._anchor = self._advanced(self._anchor, min(pose.capture_ns, self._history.newest_ns))
+            self._anchor = self._filter.advanced(self._anchor, min(pose.capture_ns, self._history.newest_ns))
             if self._is_adrift:
                 self._relocate(pose)
             else:
@@ -200,19 +175,12 @@ class Estimator:
 
     def _start(self, pose: BodyPose) -> None:
         """Starts a new estimate: a body at rest at `pose`, with INITIAL_SIGMA, and no depth readings that contradict it."""
-        x = np.zeros(STATES)
-        x[Nominal.ATTITUDE] = pose.q_wb
-        x[Nominal.POSITION] = pose.p_wt - rotate(pose.q_wb, pose.lever_b)
-        x[Nominal.DOWN] = down_of(x)
-        self._history.forget_depths(float(x[2]), MOST_STEP_M)
-        inertia = np.diag(self._body.mass)
-        sigma = np.r_[np.repeat(np.array(INITIAL_SIGMA), [3, 3, 3, 3, 3, 3, 3, 3, 1]), self._body.righting_sigma]
-        sigma[18:24] *= inertia
-        self._anchor = self._head = Belief(x, np.diag(sigma**2), pose.capture_ns)
+        self._anchor = self._head = self._filter.started(pose)
+        self._now = self._anchor.x
+        self._history.forget_depths(float(self._now[2]), MOST_STEP_M)
         self._last_tag_ns, self._last_accept_ns = pose.capture_ns, self._history.newest_ns
         self._accepted, self._refused_in_row = 1, 0
         self._starts += 1
-        self._now = x
 
     def _wait(self, time_ns: int) -> None:
         """Waits for a tag; after a second without any, starts levelled by gravity, at the last believed position and heading."""
@@ -249,14 +217,12 @@ class Estimator:
         borne_out_ns = max(self._last_accel_ns, self._last_tag_ns + ADRIFT_NS)
         return self._accepted > 0 and (few or time_ns - borne_out_ns > NO_ACCEL_LIMIT_NS)
 
-    def _stilled(self, at: Belief) -> Belief:
+    def _stand_still(self) -> None:
         """Fuses a zero velocity over ground, with noise, as a pseudo-measurement (see ADRIFT_NS); ArduPilot's EKF3 does likewise without
         aiding. Includes the vertical velocity only while depth is unmeasured. Before the first tag, fuses the believed heading too.
         """
         axes = 2 if self._history.newest_ns - self._last_depth_ns < BLIND_NS else 3
-        north = math.inf if self._has_north else NORTH_DENSITY / self._dt
-        x, covariance = observation.fuse_stillness(at.x, at.covariance, STILL_DENSITY / self._dt, axes, north)
-        return Belief(x, covariance, at.time_ns)
+        self._anchor, self._head = (self._filter.stilled(at, axes, not self._has_north) for at in (self._anchor, self._head))
 
     def _relocate(self, pose: BodyPose) -> None:
         """Relocates a body that was adrift once enough tags agree (`TagAgreement`); the state entries KEPT_STATES stay."""
@@ -276,28 +242,10 @@ class Estimator:
             if had_north:  # before the first tag the assumed heading makes that variance too small
                 self._anchor.covariance[Error.GYRO_BIAS, Error.GYRO_BIAS] = before.covariance[Error.GYRO_BIAS, Error.GYRO_BIAS]
 
-    def _advanced(self, start: Belief, to_ns: int) -> Belief:
-        """Returns the belief advanced to `to_ns`, with the inertial and depth measurements on the way fused."""
-        if to_ns <= start.time_ns:
-            return start
-        index = self._history.first_after(start.time_ns)
-        first_ns = self._history.time_of(index)
-        periods, rest_ns = divmod(to_ns - first_ns, self._history.period_ns)
-        count = periods + 1  # samples up to `to_ns`
-        if count == 0:  # the first is later
-            rest_ns = to_ns - start.time_ns
-        x, covariance = observation.advance(
-            start.x, start.covariance, *self._history.since(index), (first_ns - start.time_ns) * 1e-9, count, self._dt, rest_ns * 1e-9,
-            self._density, self._under_way, self._inertial_sigma, *self._plant,
-        )  # fmt: skip
-        return Belief(x, covariance, to_ns)
-
     def _fuse_tag(self, pose: BodyPose) -> None:
         """Fuses a picture at the anchor unless the gate refuses it."""
-        gate, at = self._p.tag_gate**2, self._anchor
-        seen = (pose.p_wt, pose.lever_b, pose.q_wb, self._tag_variance, pose.tags)
-        nis, x, covariance = observation.fuse_tag(at.x, at.covariance, *seen, gate)
-        self._anchor = Belief(x, covariance, at.time_ns)
+        gate = self._p.tag_gate**2
+        nis, self._anchor = self._filter.with_tag(self._anchor, pose, gate)
         if not nis <= gate:  # also when it is NaN
             self._refuse(pose)
             return
@@ -351,18 +299,11 @@ class Estimator:
             return
         start = max(self._head, self._anchor, key=lambda belief: belief.time_ns)
         period_ns = self._history.period_ns
-        self._head = self._advanced(start, min(time_ns - period_ns, start.time_ns + CATCH_UP * period_ns))
+        self._head = self._filter.advanced(start, min(time_ns - period_ns, start.time_ns + CATCH_UP * period_ns))
 
     def _carry(self, time_ns: int) -> tuple[np.ndarray, bool]:
         """Carries the state from the head to `time_ns`; returns sigma (6,) of its pose, and whether state and sigma are sound."""
-        head = self._head
-        index = self._history.first_after(head.time_ns)
-        taus, gyros, _ = self._history.since(index)
-        until_first = (self._history.time_of(index) - head.time_ns) * 1e-9
-        lag, rate_variance = (time_ns - head.time_ns) * 1e-9, self._p.gyro_sigma**2 * self._dt
-        self._now, sigma, sound = observation.carried(
-            head.x, head.covariance, taus, gyros, self._dt, until_first, self._density, lag, rate_variance, *self._plant
-        )
+        self._now, sigma, sound = self._filter.carried(self._head, time_ns)
         if self._is_adrift:  # the horizontal position is a guess, and before the first tag the heading is too
             sigma[:2] = UNKNOWN_SIGMA[:2]
         if not self._has_north:
@@ -398,18 +339,3 @@ class Estimator:
             ready=self._accepted >= READY_AFTER,
             starts=self._starts,
         )
-
-    def _process_noise(self) -> np.ndarray:
-        """Spectral density (28,) of the process noise of a body at rest, per second."""
-        p = self._p
-        inertia = np.diag(self._body.mass)
-        density = np.zeros(ERRORS)
-        density[Error.VELOCITY] = p.accel_process
-        density[Error.RATE] = p.alpha_process
-        density[Error.GYRO_BIAS] = p.gyro_bias_walk
-        density[Error.ACCEL_BIAS] = p.accel_bias_walk
-        density[Error.FORCE] = p.force_walk * inertia[:3]
-        density[Error.MOMENT] = p.moment_walk * inertia[3:]
-        density[Error.DEPTH_BIAS] = p.depth_bias_walk
-        density[Error.RIGHTING] = p.righting_walk * self._body.righting_sigma
-        return density**2

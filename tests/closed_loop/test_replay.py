@@ -9,7 +9,7 @@ import pytest
 
 from firmware_py.app.replay import replay
 from firmware_py.app.replay_report import replay_and_say
-from firmware_py.core.estimator import Estimator
+from firmware_py.core import kalman_filter
 from firmware_py.core.limiter import Limiter
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.signals import MCAP_MAGIC, Layout, Signal, read_messages
@@ -104,8 +104,8 @@ def test_limiter_that_was_changed_is_named(flown: Path, monkeypatch: pytest.Monk
 
 
 def test_estimator_that_was_changed_is_named(flown: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    noise = Estimator._process_noise
-    monkeypatch.setattr(Estimator, "_process_noise", lambda self: noise(self) * 1.001)
+    noise = kalman_filter.process_noise
+    monkeypatch.setattr(kalman_filter, "process_noise", lambda p, body: noise(p, body) * 1.001)
     first = replay(flown).first
     assert first is not None
     assert "/firmware/body0" in first.signal
@@ -133,11 +133,11 @@ def test_frame_that_came_otherwise_is_dropped_and_so_named(log: Path) -> None:
 
 @pytest.mark.slow
 def test_tolerance_lets_pass_what_is_within_it(flown: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    noise = Estimator._process_noise
-    monkeypatch.setattr(Estimator, "_process_noise", lambda self: noise(self) * (1.0 + 1e-9))
+    noise = kalman_filter.process_noise
+    monkeypatch.setattr(kalman_filter, "process_noise", lambda p, body: noise(p, body) * (1.0 + 1e-9))
     assert replay(flown).first is not None
     assert replay(flown, 1e-5).first is None
-    monkeypatch.setattr(Estimator, "_process_noise", lambda self: noise(self) * 1.01)
+    monkeypatch.setattr(kalman_filter, "process_noise", lambda p, body: noise(p, body) * 1.01)
     assert replay(flown, 1e-5).first is not None
 
 

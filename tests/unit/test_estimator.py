@@ -82,7 +82,7 @@ def test_head_and_anchor_believe_the_same(body: Body) -> None:
     estimator = robot.estimator
     assert estimator._head.time_ns == robot.time_ns - 2 * PERIOD
     assert estimator._anchor.time_ns == robot.time_ns - PERIOD - 500_000_000
-    caught_up = estimator._advanced(estimator._anchor, estimator._head.time_ns)
+    caught_up = estimator._filter.advanced(estimator._anchor, estimator._head.time_ns)
     np.testing.assert_allclose(estimator._head.x, caught_up.x, atol=1e-12)
     np.testing.assert_allclose(estimator._head.covariance, caught_up.covariance, atol=1e-12)
 
