@@ -19,7 +19,7 @@ from firmware_py.description.fleet import Fleet, single
 from firmware_py.description.parameters import Parameters, load_parameters
 from firmware_py.description.schema import DescriptionError, did_you_mean
 from firmware_py.description.toml_text import explained, to_toml
-from firmware_py.description.vehicle import load_vehicle, vehicle_names
+from firmware_py.description.vehicle_file import load_vehicle, vehicle_names
 from firmware_py.ground.config import GroundConfig, check_store, load_ground
 from firmware_py.ground.identity import IDENTITIES
 from firmware_py.runtime import disk

@@ -25,7 +25,7 @@ from typing import Any
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.runtime.disk import writing_to
 from hil.campaign_summary import Trial, summarise, table_of
 from hil.checks import Result

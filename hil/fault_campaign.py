@@ -16,7 +16,8 @@ import numpy as np
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.bench import fly_scenario
 from hil.fault_table import AT_S, COLUMNS, DOCK, DOCKED, NAME, PLACED, ROWS, Row
 from hil.flight import LOGS, flight_of

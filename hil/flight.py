@@ -18,7 +18,7 @@ from firmware_py.core.transitions import State
 from firmware_py.description.parameters import CONTROLLERS, Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.signals import read_signals
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import groups_of, passive_axes
 from firmware_py.runtime.recorder import CAN_LOG
 from hil import DEFAULT_BUS, USUAL_RATE_HZ

@@ -23,7 +23,8 @@ from firmware_py.description.schema import (
     read_toml,
     refuse_folder,
 )
-from firmware_py.description.vehicle import FACE_NAMES, find_vehicles, load_vehicle
+from firmware_py.description.vehicle import FACE_NAMES
+from firmware_py.description.vehicle_file import find_vehicles, load_vehicle
 from hil.checks import UNBOUNDED
 from hil.plant.dock_spec import DockSpec, JamRule
 from hil.plant.draw import stream

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from firmware_py.description.schema import did_you_mean, is_file_name, limits_of
-from firmware_py.description.vehicle import FACE_NAMES, Vehicle, face_mismatch, load_vehicle
+from firmware_py.description.vehicle import FACE_NAMES, Vehicle, face_mismatch
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.checks import UNBOUNDED
 from hil.force_metrics import force_names
 from hil.metrics import AS_ASKED, DOCKING, SHOWN, shown

@@ -11,7 +11,8 @@ import numpy as np
 
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.plant.build import nominal_centre
 from hil.plant.lattice import Place, place
 from hil.plant.spec import Tank

@@ -23,7 +23,7 @@ from identify_excitation import MOTIONS, excitation
 
 from firmware_py.app.replay import replay
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from hil.bench import fly_scenario
 from hil.flight import fly_and_judge

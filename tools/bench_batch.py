@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from bench_entry import Entry, compare
 
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.batch import fly
 from hil.plant.world import STEP_NS
 from hil.scenario import load_scenario, make_world

@@ -11,7 +11,8 @@ from numba import njit
 
 from firmware_py.core.body import DragTable
 from firmware_py.core.drag_lookup import add_drag
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare import alpha, drag_table
 from firmware_py.prepare.capability.sphere import fibonacci

@@ -24,7 +24,7 @@ from firmware_py.core.rotations import multiply, normalise, rotate, to_matrix
 from firmware_py.core.thruster import ThrusterLag
 from firmware_py.core.types import CHANNELS, Action, DockFeedback, EscFeedback, Inputs, ModuleInputs, Outputs, Request, TagObservation
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.description.water import ATMOSPHERE_PA, GRAVITY, PA_PER_M
 from firmware_py.prepare.assembly import assemble
 from firmware_py.runtime.realtime import quiet_garbage

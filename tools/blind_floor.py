@@ -20,7 +20,8 @@ from command_line import Parser, run_tool
 import numpy as np
 from scipy.linalg import expm
 
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.plant.spec import SensorSpec, WorldSpec
 from hil.safety import ICM_20602, Imu
 from hil.scenario import load_scenario

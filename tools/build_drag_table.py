@@ -26,7 +26,8 @@ from rich.table import Table
 from firmware_py.core import drag_lookup
 from firmware_py.core.body import DragTable
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare import alpha, drag_table, shape_key
 from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.capability.sphere import fibonacci

@@ -29,7 +29,8 @@ from rich.table import Table
 
 from firmware_py.description.fleet import load_fleet
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import AXES, Vehicle, load_vehicle
+from firmware_py.description.vehicle import AXES, Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import described, groups_of
 from firmware_py.prepare.capability.layout import UNITS, Layout, of_modules, of_rows, of_vehicle
 from firmware_py.prepare.capability.summary import DIRECTIONS, Capability, characterise

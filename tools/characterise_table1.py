@@ -10,7 +10,8 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from firmware_py.description.vehicle import AXES, load_vehicle
+from firmware_py.description.vehicle import AXES
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M
 from firmware_py.prepare.capability.layout import FRAMES, NORMALISATIONS, UNITS
 from firmware_py.prepare.capability.summary import Capability, Reach

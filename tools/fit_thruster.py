@@ -25,7 +25,8 @@ from scipy.optimize import nnls
 from firmware_py.core.limiter import VOLTAGE_EXPONENT
 from firmware_py.description.schema import DescriptionError, Source, build, describe, did_you_mean, frozen_array, limits_of, read_toml
 from firmware_py.description.toml_text import to_toml
-from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
+from firmware_py.description.vehicle import ThrusterCurve
+from firmware_py.description.vehicle_file import load_vehicle
 
 DEGREE = 5
 LEAST_SLOPE = 1e-3

@@ -35,7 +35,8 @@ from rich.table import Table
 
 from firmware_py.description.schema import DescriptionError, build, read_toml
 from firmware_py.description.toml_text import to_toml
-from firmware_py.description.vehicle import ThrusterCurve, Vehicle, load_vehicle
+from firmware_py.description.vehicle import ThrusterCurve, Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 
 FARTHEST_M = 10.0

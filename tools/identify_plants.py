@@ -26,7 +26,8 @@ from identify_quantities import findings
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
+from firmware_py.description.vehicle import ThrusterCurve
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.bench import fly_scenario
 from hil.flight import check_folder
 from hil.plant.draw import ModuleDraw, draw_module

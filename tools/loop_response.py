@@ -24,7 +24,8 @@ from firmware_py.core.thruster import commands
 from firmware_py.core.types import Inputs, ModuleInputs, TagObservation
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
 from hil.plant.camera import Camera
 from hil.plant.lattice import place

@@ -28,7 +28,8 @@ from rich.table import Table
 
 from firmware_py.description.parameters import CONTROLLERS, Parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import AXES, load_vehicle
+from firmware_py.description.vehicle import AXES
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M
 from firmware_py.prepare.joints import Placement, check_joints
 from hil.cli import parameters_of

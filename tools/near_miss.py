@@ -20,7 +20,8 @@ from firmware_py.core.docking import tag_table
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector
 from firmware_py.core.types import ModuleCommand, Outputs
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import FACE_NAMES, load_vehicle
+from firmware_py.description.vehicle import FACE_NAMES
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_fleet
 from hil.bench import fleet_of
 from hil.nodes import make_nodes

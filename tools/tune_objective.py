@@ -15,7 +15,7 @@ from loop_response import BODIES, Scale, body_of, margins, measure
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError, build, did_you_mean, quantity, read_toml, repeated
-from firmware_py.description.vehicle import beside
+from firmware_py.description.vehicle_file import beside
 from hil.campaign import WALL_CLOCK
 from hil.metrics import SHOWN
 from hil.scenario import Scenario, load_scenario

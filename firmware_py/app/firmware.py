@@ -16,7 +16,8 @@ from firmware_py.core.types import Inputs, Outputs, PartRequest, Request
 from firmware_py.description.fleet import Fleet, load_fleet
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError, read_toml
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_fleet, check_fleet
 from firmware_py.runtime.worker import InlineWorker, Worker
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml, repeated
-from firmware_py.description.vehicle import find_vehicles
+from firmware_py.description.vehicle_file import find_vehicles
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

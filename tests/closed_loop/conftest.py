@@ -12,7 +12,8 @@ import pytest
 import hil.scenario
 from firmware_py.bus.codec import Frame
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.bench import fly_scenario
 from hil.checks import Result
 from hil.flight import fly_and_judge

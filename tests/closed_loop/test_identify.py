@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from firmware_py.description.toml_text import to_toml
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from hil.plant.draw import draw_module
 from hil.plant.spec import WorldSpec

@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from firmware_py.description.parameters import CONTROLLERS
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.scenario import load_scenario
 from tests.closed_loop.flights import Fly
 

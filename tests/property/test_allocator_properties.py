@@ -7,7 +7,7 @@ from hypothesis.extra.numpy import arrays
 
 from firmware_py.core.allocator import Allocator
 from firmware_py.description.parameters import Allocation
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 
 always = settings(derandomize=True, deadline=None, database=None, max_examples=100)

@@ -8,7 +8,7 @@ from hypothesis.extra.numpy import arrays
 from firmware_py.core.limiter import Limiter
 from firmware_py.core.thruster import total_power
 from firmware_py.description import parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 
 always = settings(derandomize=True, deadline=None, database=None, max_examples=60)

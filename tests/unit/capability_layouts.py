@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.capability.layout import Layout, of_modules, of_rows, of_vehicle
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from firmware_py.core.body import Body
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.ground_world import Client, World
 

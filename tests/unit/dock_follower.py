@@ -9,7 +9,8 @@ from firmware_py.core.rotations import from_euler, multiply, rotate, to_matrix
 from firmware_py.core.setpoint import Wish
 from firmware_py.core.types import DockRequest, Estimate
 from firmware_py.description.parameters import Docking
-from firmware_py.description.vehicle import FACE_NORMALS, load_vehicle
+from firmware_py.description.vehicle import FACE_NORMALS
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.docking import plan_dock
 

@@ -9,7 +9,7 @@ from firmware_py.core.supervisor import Decision
 from firmware_py.core.transitions import Effect, Trigger
 from firmware_py.core.types import Estimate, Mode, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.healths import GOOD
 

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 
 from firmware_py.core import rotations
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.plant.dock_spec import JamRule
 from hil.plant.lattice import Place
 from hil.plant.spec import CALM, Tank, WorldSpec

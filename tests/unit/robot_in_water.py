@@ -11,7 +11,7 @@ from firmware_py.core.rotations import difference, from_euler, to_matrix
 from firmware_py.core.thruster import ThrusterLag
 from firmware_py.core.types import MCU_TIMED_OUT, EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 
 BODY = assemble_vehicle(load_vehicle("modcube"))

@@ -28,7 +28,7 @@ from firmware_py.core.types import (
     TagObservation,
 )
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare.assembly import PITCH_M, assemble
 

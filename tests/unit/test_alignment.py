@@ -12,7 +12,7 @@ from firmware_py.core.estimator import READY_AFTER, RESET_AFTER, Estimator
 from firmware_py.core.rotations import difference, exp, from_euler, heading, multiply
 from firmware_py.core.types import NEVER_AGE_NS, BodyPose, Estimate, Measured
 from firmware_py.description.parameters import Estimation
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 
 BODY = assemble_vehicle(load_vehicle("modcube"))

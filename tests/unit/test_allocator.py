@@ -14,7 +14,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.preload import preload
 from firmware_py.core.types import Thrust, ThrustLimits
 from firmware_py.description.parameters import Allocation
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 HOLDING_SHARE, SHARE_WEIGHT, PRIORITIES = 0.05, 1e3, np.array([1e2, 1e2, 1.0])

@@ -17,7 +17,7 @@ from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockRequest, Mode, Request
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Limiter, Parameters
-from firmware_py.description.vehicle import load_vehicle, vehicle_names
+from firmware_py.description.vehicle_file import load_vehicle, vehicle_names
 from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.healths import BLIND, GOOD, UPRIGHT
 from tests.unit.tanks import Tank

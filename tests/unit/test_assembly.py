@@ -11,7 +11,8 @@ from firmware_py.core import rotations
 from firmware_py.core.rigid_body import coriolis_wrench
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.schema import DescriptionError, frozen_array
-from firmware_py.description.vehicle import Payload, Vehicle, load_vehicle
+from firmware_py.description.vehicle import Payload, Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.description.water import GRAVITY
 from firmware_py.prepare import lattice
 from firmware_py.prepare.assembly import assemble, assemble_fleet, assemble_vehicle, passive_axes

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from blind_floor import GUST_TARGET, PERIOD_S, PLACE, RATE, STATES, TILT, WATER, floor, model, without_tags
 
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.plant.bodies import weigh
 from hil.plant.spec import SensorSpec, WorldSpec
 from hil.safety import ICM_20602

@@ -9,7 +9,7 @@ import pytest
 
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.campaign import SUMMARY_FILE, TABLE_FILE, TRIALS_FILE, fly_trial, identity, outcome_of, run_campaign
 from hil.checks import Check, Result
 from hil.plant.draw import draw_module

@@ -22,7 +22,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.types import Setpoint
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare import paths
 from firmware_py.prepare.assembly import assemble, assemble_vehicle

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_py.core.thruster import total_power
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.capability.layout import FRAMES, Layout, of_vehicle
 from firmware_py.prepare.capability.power import electrical_power, least_squares_forces, power_space
 from firmware_py.prepare.capability.sphere import fibonacci

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from firmware_py.description.schema import DescriptionError, frozen_array
-from firmware_py.description.vehicle import Payload, load_vehicle
+from firmware_py.description.vehicle import Payload
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from firmware_py.prepare.capability.layout import of_modules, of_vehicle
 from firmware_py.prepare.lattice import MATRICES

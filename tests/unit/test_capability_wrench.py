@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import AXES, load_vehicle
+from firmware_py.description.vehicle import AXES
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.capability import summary
 from firmware_py.prepare.capability.ellipsoid import largest_inscribed
 from firmware_py.prepare.capability.layout import FRAMES, Layout, of_modules, of_rows, of_vehicle

@@ -19,7 +19,7 @@ from firmware_py.cli import main
 from firmware_py.description.parameters import Parameters, load_parameters, registry
 from firmware_py.description.schema import describe
 from firmware_py.description.toml_text import to_toml
-from firmware_py.description.vehicle import load_vehicle, vehicle_names
+from firmware_py.description.vehicle_file import load_vehicle, vehicle_names
 from firmware_py.runtime.guarded_file import GuardedFile
 from hil.scenario_files import scenario_names
 from hil.trial_file import TrialFile

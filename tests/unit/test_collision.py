@@ -16,7 +16,7 @@ from firmware_py.core.rotations import from_euler, rotate_back
 from firmware_py.core.setpoint import REST, Glider
 from firmware_py.core.types import NEVER_AGE_NS, Action, EscFeedback, Estimate, Mode, Request, Setpoint, Sticks
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble, assemble_vehicle
 from tests.unit.tanks import MODCUBE, FaultyTank, world
 

@@ -16,7 +16,7 @@ from firmware_py.core.setpoint import rest_at
 from firmware_py.core.types import Estimate, Setpoint
 from firmware_py.description.parameters import Control
 from firmware_py.description.schema import limits_of
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])

@@ -10,7 +10,7 @@ import pytest
 from firmware_py.core.depth_gate import DOUBT, LEAST_GATE_M, MOST_SPEED_M_S, MOST_STEP_M, SETTLED, DepthGate
 from firmware_py.core.rotations import from_euler, to_matrix
 from firmware_py.core.types import BodyPose, ExpectedDepth, Mode, ModuleInputs
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.description.water import ATMOSPHERE_PA, PA_PER_M
 from firmware_py.prepare.assembly import assemble
 from tests.unit.estimated_robot import P_WB, PERIOD, Robot, sensors

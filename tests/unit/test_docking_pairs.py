@@ -12,7 +12,8 @@ from firmware_py.core.joints import joints_of
 from firmware_py.core.rotations import conjugate, from_euler, multiply, rotate
 from firmware_py.core.types import DockFeedback, ModuleInputs, TagObservation
 from firmware_py.description.parameters import Docking
-from firmware_py.description.vehicle import FACE_NORMALS, load_vehicle
+from firmware_py.description.vehicle import FACE_NORMALS
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 TICK_NS, PITCH_M = 10_000_000, 0.21

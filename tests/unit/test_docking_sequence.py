@@ -11,7 +11,8 @@ from firmware_py.core.rotations import conjugate, difference, from_euler, multip
 from firmware_py.core.setpoint import REST, Wish
 from firmware_py.core.types import NEVER_AGE_NS, RELAY_OFF, RELAY_PULL, RELAY_PUSH, DockRequest
 from firmware_py.description.parameters import PAPER, Docking
-from firmware_py.description.vehicle import FACE_NORMALS, load_vehicle
+from firmware_py.description.vehicle import FACE_NORMALS
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.docking import plan_dock
 from tests.unit.dock_follower import DRIFT, NEITHER, STAGED, TICK_NS, TILTED, Follower, estimate, face_of

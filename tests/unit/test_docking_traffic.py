@@ -10,7 +10,7 @@ from firmware_py.core.docking_traffic import Dock, Traffic
 from firmware_py.core.setpoint import REST, Wish
 from firmware_py.core.types import DockRequest
 from firmware_py.description.parameters import Docking
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.docking import plan_dock
 from tests.unit.dock_follower import LEVEL, STAGED, estimate

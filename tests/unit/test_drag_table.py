@@ -15,7 +15,8 @@ from typer.testing import CliRunner
 from firmware_py.core import drag_lookup
 from firmware_py.core.body import DragTable
 from firmware_py.description.schema import DescriptionError, frozen_array
-from firmware_py.description.vehicle import Payload, Vehicle, load_vehicle
+from firmware_py.description.vehicle import Payload, Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare import drag_table, lattice, shape_key
 from firmware_py.prepare.alpha import lattice_method

@@ -12,7 +12,7 @@ from firmware_py.core.drag_lookup import add_drag
 from firmware_py.core.estimator import READY_AFTER
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
 from firmware_py.core.types import NEVER_AGE_NS, Measured
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.estimated_robot import DELAY_TICKS, NOTHING, P_WB, PERIOD, Q_WB, P, Robot, assert_rests, holding, sensors, tag, world
 

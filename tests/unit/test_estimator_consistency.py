@@ -18,7 +18,7 @@ from firmware_py.core.topology import TURNING
 from firmware_py.core.types import BodyPose, Estimate, Measured, Setpoint
 from firmware_py.description.parameters import Control, Estimation
 from firmware_py.description.schema import limits_of
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 PERIOD = 10_000_000

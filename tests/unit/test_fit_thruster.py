@@ -9,7 +9,8 @@ import pytest
 from scipy import constants
 
 from firmware_py.description.schema import DescriptionError, build, read_toml
-from firmware_py.description.vehicle import ThrusterCurve, load_vehicle
+from firmware_py.description.vehicle import ThrusterCurve
+from firmware_py.description.vehicle_file import load_vehicle
 
 tool = importlib.import_module("fit_thruster")
 LIKE = load_vehicle("modcube").curve

@@ -16,7 +16,7 @@ from firmware_py.core.rotations import rotate
 from firmware_py.core.transitions import State
 from firmware_py.core.types import NEVER_AGE_NS, Action, Mode
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.ground.dialect import load_dialect
 from firmware_py.ground.identity import px4
 from firmware_py.ground.picture import Picture

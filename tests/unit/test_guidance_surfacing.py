@@ -10,7 +10,7 @@ from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import Effect
 from firmware_py.core.types import Mode
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from tests.unit.guidance_flight import LEVEL, WRENCH, ZERO, Flight, estimate
 from tests.unit.healths import BLIND, GOOD, UPRIGHT

@@ -35,7 +35,7 @@ from firmware_py.core.types import (
 )
 from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 TICK_NS = 10_000_000

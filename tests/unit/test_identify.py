@@ -22,7 +22,8 @@ from firmware_py.core.types import BodyPose
 from firmware_py.description.parameters import Estimation
 from firmware_py.description.schema import DescriptionError, build, frozen_array, read_toml
 from firmware_py.description.toml_text import to_toml
-from firmware_py.description.vehicle import Payload, Vehicle, load_vehicle, vehicle_names
+from firmware_py.description.vehicle import Payload, Vehicle
+from firmware_py.description.vehicle_file import load_vehicle, vehicle_names
 from firmware_py.description.water import GRAVITY
 from firmware_py.prepare.assembly import assemble_vehicle
 from hil.plant.spec import WorldSpec

@@ -11,7 +11,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.least_power import LeastPower, slopes
 from firmware_py.core.thruster import polynomial, total_power
 from firmware_py.description.parameters import Allocation
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble, assemble_vehicle
 
 LEAST = Allocation(mode="least_power")

@@ -18,7 +18,7 @@ from firmware_py.core.limiter import (
 from firmware_py.core.thruster import total_power
 from firmware_py.core.types import FACES, RELAY_OFF, RELAY_PULL, RELAY_PUSH
 from firmware_py.description import parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 DT = 0.01

@@ -12,7 +12,8 @@ from matplotlib import pyplot
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.schema import DescriptionError
 from firmware_py.description.toml_text import to_toml
-from firmware_py.description.vehicle import AXES, load_vehicle
+from firmware_py.description.vehicle import AXES
+from firmware_py.description.vehicle_file import load_vehicle
 
 SURGE = 0
 

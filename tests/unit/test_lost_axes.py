@@ -13,7 +13,7 @@ from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.robot_in_water import BODY, TICK_NS, ZERO, Water
 

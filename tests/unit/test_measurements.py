@@ -11,7 +11,7 @@ from firmware_py.core.drag_lookup import drag_wrench
 from firmware_py.core.measurements import SECOND_HAND, SECOND_HAND_WEIGHT, Measurements
 from firmware_py.core.rotations import difference, exp, from_euler, multiply, to_matrix
 from firmware_py.core.types import BodyPose, Measured, ModuleInputs, TagObservation
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.description.water import WATER_DENSITY
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.lattice import MATRICES

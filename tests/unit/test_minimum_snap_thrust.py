@@ -8,7 +8,7 @@ import pytest
 
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare import paths
 from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, plan

@@ -26,7 +26,7 @@ from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import Estimate, Measured
 from firmware_py.description.failsafe_parameters import Faults
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble, assemble_vehicle
 from tests.unit.robot_in_water import BODY, PUSH, TICK_NS, ZERO, Water
 

@@ -8,7 +8,7 @@ from firmware_py.core.faults import STALLED, WHY, FaultDetector
 from firmware_py.core.names import Place, list_thrusters, name_thruster, places_of
 from firmware_py.core.types import EscFeedback, Event
 from firmware_py.description.failsafe_parameters import Faults
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from tests.unit.ground_world import World
 from tests.unit.robot_in_water import TICK_NS

@@ -12,7 +12,7 @@ from firmware_py.core.rotations import difference, exp, from_euler, multiply
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.types import Action, Estimate, Mode, ModuleInputs, Request, Setpoint
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.paths import line
 from tests.unit.tanks import DT, PERIOD, START, Tank, has_power, single

@@ -7,7 +7,7 @@ from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.transitions import State
 from firmware_py.core.types import INFORMATION, WARNING, Action, Event, Mode, ModuleInputs, Request
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.module_at_rest import PERIOD_NS, resting
 from tests.unit.tanks import DT, Tank, has_power, single

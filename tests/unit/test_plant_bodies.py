@@ -10,7 +10,8 @@ from scipy.spatial import ConvexHull
 
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.plant import drag
 from hil.plant.spec import CALM, Tank, WorldSpec
 from hil.plant.world import Start, World

@@ -9,7 +9,8 @@ import pytest
 
 from firmware_py.bus.codec import Codec
 from firmware_py.core import rotations
-from firmware_py.description.vehicle import Payload, load_vehicle
+from firmware_py.description.vehicle import Payload
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.nodes import make_nodes
 from hil.plant.camera import Camera, Sighting, placed
 from hil.plant.sight import crosses

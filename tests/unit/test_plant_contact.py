@@ -10,7 +10,8 @@ from scipy.optimize import linprog
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
 from firmware_py.core import rotations
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.plant.contact import touch
 from hil.plant.dock_spec import DockSpec
 from hil.plant.spec import CALM, WorldSpec

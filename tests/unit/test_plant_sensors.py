@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from firmware_py.core import rotations
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.plant.sensors import Sensors
 from hil.plant.spec import CALM, IDEAL, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, Truth, World

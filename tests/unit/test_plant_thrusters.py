@@ -8,7 +8,8 @@ import pytest
 from scipy.linalg import solve_continuous_lyapunov
 
 from firmware_py.core import rotations
-from firmware_py.description.vehicle import Vehicle, load_vehicle
+from firmware_py.description.vehicle import Vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.batch import fly
 from hil.plant.jets import add_jets, in_the_way
 from hil.plant.spec import CALM, Tank, WorldSpec

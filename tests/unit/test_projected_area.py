@@ -9,7 +9,7 @@ import pytest
 import shapely
 
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare import alpha, hulls
 from firmware_py.prepare.projected_area import (
     Solid,

@@ -14,7 +14,7 @@ from firmware_py.core import observation, propagation
 from firmware_py.core.body import Body
 from firmware_py.core.propagation import ERRORS
 from firmware_py.core.rotations import difference, exp, from_euler, multiply
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 BLOCKS = {

@@ -18,7 +18,7 @@ from rich.console import Console
 
 from firmware_py.core.types import NEVER_AGE_NS
 from firmware_py.description.parameters import CONTROLLERS
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from hil.checks import UNBOUNDED, Limit, Result, judge
 from hil.console import flight_progress, print_result
 from hil.flight import _scene, as_wanted, flown_of, wanted_in

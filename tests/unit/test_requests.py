@@ -11,7 +11,7 @@ from firmware_py.core.rotations import from_euler
 from firmware_py.core.setpoint import rest_at
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockRequest, Event, Mode, Request, Setpoint, Sticks
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from firmware_py.prepare.paths import Hold
 from tests.unit.tanks import DT, Tank, single

@@ -12,7 +12,7 @@ from firmware_py.core.measurements import Measurements
 from firmware_py.core.rotations import difference
 from firmware_py.core.sensor_watch import AXIS_REPEATS, IMU_REPEATS, LEAPS, SENSOR_REPEATS, SensorWatch
 from firmware_py.core.types import Action, Mode, ModuleInputs, Request
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from hil.plant.spec import HALF_A_COUNT
 from tests.unit.tanks import PERIOD, Tank, flies_with_noise, single

@@ -7,7 +7,7 @@ from firmware_py.core.faults import FaultDetector
 from firmware_py.core.preload import preload
 from firmware_py.core.types import CHANNELS, MCU_TIMED_OUT, MCU_UNFIT, EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from tests.unit.robot_in_water import Water
 

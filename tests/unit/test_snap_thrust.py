@@ -17,7 +17,7 @@ from firmware_py.core.controller import Controller
 from firmware_py.core.setpoint import Trajectory
 from firmware_py.core.types import Estimate
 from firmware_py.description.parameters import Allocation, Control
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.ground.mission_legs import Leg
 from firmware_py.ground.plan_jobs import Plan, PlanJob
 from firmware_py.prepare import snap_thrust

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from firmware_py.core.rotations import from_euler
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare import minimum_snap
 from firmware_py.prepare.assembly import assemble_vehicle
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, fastest, plan

@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.core.supply import SupplyMeter
 from firmware_py.core.types import ModuleInputs
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 
 NOMINAL_V = 12.0

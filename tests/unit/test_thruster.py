@@ -9,7 +9,7 @@ import pytest
 from firmware_py.core import thruster
 from firmware_py.core.body import ThrusterSet
 from firmware_py.core.thruster import ThrusterLag
-from firmware_py.description.vehicle import load_vehicle, vehicle_names
+from firmware_py.description.vehicle_file import load_vehicle, vehicle_names
 from firmware_py.prepare.assembly import assemble_vehicle
 
 DT = 0.01

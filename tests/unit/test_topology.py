@@ -9,7 +9,7 @@ from firmware_py.core.propagation import ERRORS, STATES
 from firmware_py.core.topology import Motion, join, part_of
 from firmware_py.core.types import DockRequest
 from firmware_py.description.schema import DescriptionError
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M, assemble
 from firmware_py.prepare.docking import plan_dock, plan_undock
 

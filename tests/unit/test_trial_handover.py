@@ -12,7 +12,7 @@ from firmware_py.core.thruster_trial import JUDGED, SETTLE, ThrusterTrial
 from firmware_py.core.topology import Motion, join, moved_wrench, part_of
 from firmware_py.core.trial_handover import Held, carried_over
 from firmware_py.description.failsafe_parameters import Faults
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
 from tests.unit.robot_in_water import PUSH, TICK_NS, Water
 

@@ -13,15 +13,8 @@ from scipy.spatial.transform import Rotation
 from firmware_py import cli
 from firmware_py.description.schema import DescriptionError, limits_of
 from firmware_py.description.toml_text import to_toml
-from firmware_py.description.vehicle import (
-    FACE_NAMES,
-    FACE_NORMALS,
-    Drag,
-    Inertial,
-    Vehicle,
-    load_vehicle,
-    vehicle_names,
-)
+from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS, Drag, Inertial, Vehicle
+from firmware_py.description.vehicle_file import load_vehicle, vehicle_names
 from firmware_py.prepare.assembly import assemble_vehicle
 from tests.unit.capability_layouts import FLU_TO_FRD
 

@@ -17,7 +17,7 @@ from firmware_py.core.pipeline import Pipeline
 from firmware_py.core.types import DockRequest, Inputs, ModuleInputs, Outputs, PartRequest
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.vehicle import load_vehicle
+from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import PITCH_M
 from firmware_py.runtime.worker import InlineWorker, Job, ThreadWorker, Worker
 
