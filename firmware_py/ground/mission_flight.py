@@ -15,8 +15,9 @@ from firmware_py.ground.mission_items import FASTEST, SLOWEST, SPEED_DEFAULT, SP
 from firmware_py.ground.mission_legs import GO_TO, Flight, Leg, at_another_speed, legs_from
 from firmware_py.ground.plan_jobs import Plan, PlanJobs
 from firmware_py.ground.reached_items import ReachedItems
+from firmware_py.ground.subject import ACTIVE, DONE, NO_MISSION, PAUSED, READY
 from firmware_py.ground.system import NS_PER_S, System
-from firmware_py.ground.telemetry import ACTIVE, DONE, NO_MISSION, PAUSED, READY, mission_current
+from firmware_py.ground.telemetry import mission_current
 
 _SETTLE_TICKS = 3
 """Ticks from the request of a hold to reading where the body is held."""

@@ -29,8 +29,8 @@ from firmware_py.ground.plan_jobs import Plan, PlanJob
 from firmware_py.ground.presence import Presence, Watch
 from firmware_py.ground.signing import Signing
 from firmware_py.ground.steering import Steering
+from firmware_py.ground.subject import Subject
 from firmware_py.ground.system import NEVER_WAITS, Arrival, System
-from firmware_py.ground.telemetry import Subject
 from firmware_py.ground.wire import Framer, Packet
 
 _SENDERS = 256

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 from firmware_py.core.types import WARNING, Action, Request
 from firmware_py.ground.dialect import Message
 from firmware_py.ground.outbox import Outbox, Rates
-from firmware_py.ground.telemetry import DEFAULT_HZ, STREAMS, Subject
+from firmware_py.ground.subject import Subject
+from firmware_py.ground.telemetry import DEFAULT_HZ, STREAMS
 
 NS_PER_S = 1_000_000_000
 _TEXT = 50

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from firmware_py.core.rotations import rotate, to_euler
-from firmware_py.core.types import CHANNELS, BodyRecord
+from firmware_py.core.rotations import to_euler
+from firmware_py.core.types import CHANNELS
 from firmware_py.description.vehicle import FACE_NAMES
-from firmware_py.ground.geodesy import Origin
-from firmware_py.ground.identity import TYPE_SUBMARINE, Identity, base_mode
-from firmware_py.ground.picture import ESC_SILENT, ModulePicture, Picture
+from firmware_py.ground.identity import TYPE_SUBMARINE, base_mode
+from firmware_py.ground.picture import ESC_SILENT, ModulePicture
+from firmware_py.ground.subject import ACTIVE, Subject
 from firmware_py.ground.tick_times import histograms, load_permille
 
 Values = Mapping[str, Any]
@@ -27,76 +26,6 @@ _NO_GPS = 0
 """GPS_FIX_TYPE."""
 _FRAME_LOCAL_NED, _FRAME_BODY_FRD = 1, 12
 _PWM_CENTRE, _PWM_HALF = 1500, 400
-NO_MISSION, READY, ACTIVE, PAUSED, DONE = 1, 2, 3, 4, 5
-"""MISSION_STATE."""
-
-
-@dataclass(slots=True)
-class Progress:
-    """Progress of a mission, as MISSION_CURRENT reports it."""
-
-    current: int = 0
-    total: int = 0
-    state: int = NO_MISSION
-
-
-@dataclass(slots=True)
-class Subject:
-    """The body whose telemetry is sent, with all that the messages are built from."""
-
-    body: int
-    picture: Picture
-    identity: Identity
-    origin: Origin
-    progress: Progress = field(default_factory=Progress)
-    mode_number: int | None = None
-    """Custom-mode number by which a client chose the present mode, where several numbers stand for it."""
-    neutral: bool = True
-    """Whether no pilot deflects a stick."""
-
-    @property
-    def record(self) -> BodyRecord:
-        """The body's record of the last tick."""
-        return self.picture.records[self.body]
-
-    @property
-    def modules(self) -> Sequence[ModulePicture]:
-        """The body's modules, in order."""
-        return [self.picture.modules[m] for m in self.picture.members(self.body)]
-
-    @property
-    def leader(self) -> int:
-        """Number of the body that contains the module of this body's number: its own, except while docked into another body."""
-        return self.picture.leader(self.body)
-
-    @property
-    def time_ms(self) -> int:
-        """Time since start in 32 bits; wraps around after 49.7 days."""
-        return self.picture.time_ns // 1_000_000 & 0xFFFFFFFF
-
-    @property
-    def time_us(self) -> int:
-        """Time since start."""
-        return self.picture.time_ns // 1_000
-
-    @property
-    def v_w(self) -> np.ndarray:
-        """(3,) velocity of the centre of mass, world, m/s."""
-        e = self.record.estimate
-        return np.asarray(rotate(e.q_wb, np.ascontiguousarray(e.nu[:3])))
-
-    @property
-    def armed(self) -> bool:
-        """Whether thrusters may turn."""
-        return self.picture.is_armed(self.body)
-
-    @property
-    def custom_mode(self) -> int:
-        """Number of the present mode in the identity's encoding."""
-        mode = self.picture.mode(self.body)
-        if self.mode_number in self.identity.numbers[mode]:
-            return int(self.mode_number)
-        return self.identity.custom_mode(mode)
 
 
 def heartbeat(s: Subject) -> list[Values]:
