@@ -8,44 +8,27 @@ obeys no commands, stay excluded until it has been well for as long (`SILENT_NS`
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
-from firmware_py.core.body import Body, deceleration_of, rank_by, rank_of
+from firmware_py.core.body import Body
 from firmware_py.core.command_watch import CommandWatch
+from firmware_py.core.esc_feedback import ESC_DOWN, ESC_FAILED, FAST_MARGIN, FAST_SHARE, WHY, WRONG_SPEED, believed_rpm, count_feedback
 from firmware_py.core.missing_thrust import MissingThrust
 from firmware_py.core.names import name_modules, name_thruster, places_of
-from firmware_py.core.rotations import M, V
 from firmware_py.core.thruster import polynomial
+from firmware_py.core.thruster_state import ThrusterFaults, thruster_state
 from firmware_py.core.topology import in_both
 from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 
-ESC_DOWN = (1, 3)
-"""EscStatus FAULT and SILENT."""
-WHY = ("has an ESC that failed", "stands still", "does not obey")
-ESC_FAILED, STALLED, WRONG_SPEED = range(len(WHY))
-"""Faults that enough ESC feedbacks in a row may show, gravest first."""
 NEITHER = (-1, -1)
 """Thruster indices for a feedback of ESCs that the vehicle does not have."""
-LEAST_LEVER = 0.1
-"""Smallest moment part of a lost axis (a unit vector) that is traded for force: below it, keeping a newton costs more than 10 N m; 1e16
-where the moment part is rounding."""
-FAST_SHARE = 2.0
-"""A propeller does not obey if it turns faster than this multiple of its believed speed plus `FAST_MARGIN`."""
-FAST_MARGIN = 0.25
-"""Margin for a speed that is too high or of the wrong sign, as a share of full speed: deadband and lag explain smaller deviations."""
 STANDSTILL = 1.45
 """Multiple of the deadband in the vehicle file up to which a healthy propeller may stand still; deadbands differ from thruster to thruster,
 on the bench from 0.10 to 0.25 N where the file says 0.17."""
-CLEAR = 4.0
-"""A repeated standstill counts twice where the believed force is at least this many times the least judged force: the propeller is not
-just about to start."""
 SILENT_NS = 500_000_000
 """Silence, or deafness, after which a module's thrusters are excluded, if the others can make every wrench without them; the fail-safe
 `module_silent` acts then too. A silent module that hears nothing either has stopped its thrusters after 100 ms (can_dbc/README.md); one
@@ -58,39 +41,6 @@ in every tick, the counts in a row would end within 30 ms, in which a healthy pr
 BELIEVED_NS = 500_000_000
 """How long believed forces are kept: the feedback of a module whose answers come late is compared with those of its own time. Against the
 present ones, propellers that reverse seemed to disobey where frames were 30 ms late each way."""
-FEEDBACK_WEIGHT = 0.3
-"""Weight of one ESC feedback in the running share of force that a thruster reports. Ten to thirteen are judged per second (`REPORT_NS`),
-which gives a memory of 0.3 s: less than the half second of motion that core.missing_thrust judges."""
-
-
-class ThrusterFaults(NamedTuple):
-    """Fault state of a body's thrusters."""
-
-    alive: np.ndarray
-    """(n,) bool: thrusters that may be used."""
-    dead: tuple[int, ...]
-    """Indices of thrusters found dead or lying."""
-    lost_axes: int
-    """Rank lost from the thruster matrix because of unusable thrusters; passive axes do not count."""
-    keep: np.ndarray
-    """(6, 6) matrix that removes from a wrench its passive axes and what the usable thrusters cannot make."""
-    deceleration: np.ndarray
-    """(2,) that of the usable thrusters, as Body.deceleration."""
-
-
-def _keep(made: np.ndarray, lost: np.ndarray) -> np.ndarray:
-    """Returns the (6, 6) matrix that makes a wrench feasible: it gives up moment first, so that the force stays, and force only then.
-
-    Args:
-        made, lost: (6, r) and (6, 6 - r) orthonormal bases of the wrenches that can be made, and of the rest.
-    """
-    if not lost.size:
-        return np.eye(6)  # exact
-    turned, levers, axes = np.linalg.svd(lost[3:], full_matrices=False)
-    long = levers > LEAST_LEVER
-    give_up = np.eye(6)
-    give_up[3:] -= turned[:, long] / levers[long] @ axes[long] @ lost.T
-    return np.asarray(made @ made.T @ give_up)
 
 
 def by_channel(body: Body) -> list[dict[int, int]]:
@@ -108,7 +58,7 @@ class FaultDetector:
     def __init__(self, body: Body, parameters: Faults, period_ns: int) -> None:
         t = body.thrusters
         self._t = t
-        self._mass, self._passive = body.mass, list(body.passive)
+        self._body = body
         self._thruster_at = by_channel(body)
         self._pair_at = [{c: (at.get(c, -1), at.get(c + 1, -1)) for c in range(max(at) + 1)} for at in self._thruster_at]
         """Per module and first channel of an ESC feedback: the indices of its two thrusters, -1 where there is none."""
@@ -138,7 +88,6 @@ class FaultDetector:
         """Believed forces (n,) of the latest ticks, N."""
         self._late_ticks = [0] * len(body.modules)
         """How late each module's latest answer was."""
-        self._rank = self._steered_rank(t.matrix)
         self._counts = np.zeros((n, len(WHY)), dtype=np.int64)
         """(n, 3) feedbacks in a row that showed ESC_FAILED, STALLED and WRONG_SPEED."""
         self._feedback_means, self._reported_share = np.zeros((n, 2)), np.ones(n)
@@ -147,7 +96,7 @@ class FaultDetector:
         """Messages of this tick, for people."""
         self.changed = False
         """Whether `now` changed in this tick."""
-        self.now = self._state_for(self._obeys)
+        self.now = thruster_state(self._body, self._obeys)
 
     def retune(self, parameters: Faults) -> None:
         """Applies new limits from this tick on; known faults stay."""
@@ -176,7 +125,7 @@ class FaultDetector:
         self._motion.reset()
         self.changed = not self.now.alive.all()
         self._obeys[:], self._silent, self._well = True, [], {}
-        self.now = self._state_for(self._obeys)
+        self.now = thruster_state(self._body, self._obeys)
 
     def step(
         self,
@@ -259,10 +208,10 @@ class FaultDetector:
 
     def _usable_state(self) -> ThrusterFaults:
         """Returns the fault state: all thrusters that obey, without those of silent modules where the others have the same rank."""
-        obeying = self._state_for(self._obeys)
+        obeying = thruster_state(self._body, self._obeys)
         if not self._silent:
             return obeying
-        without = self._state_for(self._obeys & ~np.isin(self._t.module, self._silent))
+        without = thruster_state(self._body, self._obeys & ~np.isin(self._t.module, self._silent))
         return without._replace(dead=obeying.dead) if without.lost_axes == obeying.lost_axes else obeying
 
     def _judge_feedback(self, feedbacks: list[list[EscFeedback]], force_n: np.ndarray) -> None:
@@ -331,62 +280,3 @@ class FaultDetector:
         self.now, self.changed = self._usable_state(), True
         self._motion.forget()
         self.words.append(f"{self._names[i]} is used again: {why}")
-
-    def _state_for(self, usable: np.ndarray) -> ThrusterFaults:
-        alive = usable.copy()
-        u, values, _ = np.linalg.svd(self._t.matrix * alive, full_matrices=alive.size < 6)  # u is (6, 6) even with fewer thrusters
-        rank = rank_by(values)
-        dead = tuple(int(i) for i in np.flatnonzero(~alive))
-        keep = _keep(u[:, :rank], u[:, rank:])
-        keep[:, self._passive] = 0.0
-        lost_axes = self._rank - self._steered_rank(self._t.matrix * alive)
-        return ThrusterFaults(alive, dead, lost_axes, keep, deceleration_of(self._t, self._mass, self._passive, alive))
-
-    def _steered_rank(self, matrix: np.ndarray) -> int:
-        """Returns the rank of a (6, n) thruster matrix without its passive axes."""
-        return rank_of(np.delete(matrix, self._passive, axis=0))
-
-
-@njit(f"float64(float64,{V},float64)", cache=True)
-def believed_rpm(force_n, full_n, rpm_at_full):  # type: ignore[no-untyped-def]
-    """Returns the speed of a thruster at a force, 1/min; thrust grows with its square. full_n: (2,) full force forward, reverse."""
-    return math.copysign(rpm_at_full * math.sqrt(abs(force_n) / full_n[0 if force_n > 0.0 else 1]), force_n)
-
-
-@njit(f"boolean(float64[:,:,::1],{V},boolean[::1],{M},{V},{V},float64,int64[::1],int64[:,::1],{M},{V})", cache=True)
-def count_feedback(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_share, needed, counts, means, share):  # type: ignore[no-untyped-def]
-    """Updates fault counts and force shares from ESC feedback; returns whether any thruster has shown a fault often enough.
-
-    Args:
-        feedback: (k, 3, 2) per frame the indices (-1: none), speeds 1/min and EscStatus of its two thrusters.
-        force_n, alive, full_n, rpm_at_full: per thruster believed force, whether usable, full forces (n, 2), full speed.
-        least_n: (n,) smallest believed force at which a standstill is judged, N; dead_share: the parameter.
-        needed: (3,) feedbacks in a row that suffice for ESC_FAILED, STALLED, WRONG_SPEED.
-        counts: (n, 3) feedbacks in a row that showed ESC_FAILED, STALLED, WRONG_SPEED; a clear STALLED after another one counts twice.
-        means: (n, 2) running means of reported times believed force, and of believed force squared, any unit.
-        share: (n,) share of the believed force that the speeds report, 0 to 1: a thruster whose ESC reports it as weak is not a liar.
-    """
-    found = False
-    for k in range(feedback.shape[0]):
-        for side in range(2):
-            i, rpm, status = int(feedback[k, 0, side]), feedback[k, 1, side], int(feedback[k, 2, side])
-            if i < 0 or not alive[i]:
-                continue
-            believed = believed_rpm(force_n[i], full_n[i], rpm_at_full[i])
-            count, margin = counts[i], FAST_MARGIN * rpm_at_full[i]
-            asked, given = believed * abs(believed), rpm * abs(rpm)  # as believed_rpm: force goes with the square of the speed
-            means[i, 0] += FEEDBACK_WEIGHT * (given * asked - means[i, 0])
-            means[i, 1] += FEEDBACK_WEIGHT * (asked * asked - means[i, 1])
-            share[i] = min(1.0, max(0.0, means[i, 0] / means[i, 1])) if means[i, 1] > 0.0 else 1.0
-            failed = status in ESC_DOWN  # which explains any speed
-            stands = abs(rpm) < dead_share * abs(believed) and not failed
-            wrong_way = rpm * believed < 0.0 and not stands and abs(rpm - believed) > margin
-            too_fast = abs(rpm) > FAST_SHARE * abs(believed) + margin
-            count[ESC_FAILED] = count[ESC_FAILED] + 1 if failed else 0
-            if abs(force_n[i]) >= least_n[i]:
-                step = 2 if count[STALLED] > 0 and abs(force_n[i]) >= CLEAR * least_n[i] else 1
-                count[STALLED] = count[STALLED] + step if stands else 0
-            count[WRONG_SPEED] = count[WRONG_SPEED] + 1 if (wrong_way or too_fast) and not failed else 0
-            for kind in range(len(WHY)):
-                found = found or count[kind] >= needed[kind]
-    return found

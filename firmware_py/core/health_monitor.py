@@ -9,12 +9,14 @@ from dataclasses import astuple, dataclass
 import numpy as np
 
 from firmware_py.core.body import Body, axes_without_thrust
-from firmware_py.core.faults import ESC_DOWN, ThrusterFaults, by_channel
+from firmware_py.core.esc_feedback import ESC_DOWN
+from firmware_py.core.faults import by_channel
 from firmware_py.core.fence import outside
 from firmware_py.core.health import Health
 from firmware_py.core.module_reports import ModuleReports
 from firmware_py.core.names import Place, places_of
 from firmware_py.core.rotations import difference, rotate
+from firmware_py.core.thruster_state import ThrusterFaults
 from firmware_py.core.types import (
     MCU_ESTOP,
     MCU_UNFIT,

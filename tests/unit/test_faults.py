@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from firmware_py.core.faults import CLEAR, FaultDetector
+from firmware_py.core.esc_feedback import CLEAR
+from firmware_py.core.faults import FaultDetector
 from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 from tests.unit.robot_in_water import BODY, DT, PUSH, Water

@@ -9,7 +9,6 @@ import pytest
 
 from firmware_py.core.body import Body
 from firmware_py.core.failsafes import TABLE, Failsafes, Watch
-from firmware_py.core.faults import ThrusterFaults
 from firmware_py.core.fence import outside
 from firmware_py.core.health import NEVER_S, Health
 from firmware_py.core.health_monitor import HealthMonitor
@@ -18,6 +17,7 @@ from firmware_py.core.names import Place
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import exp
 from firmware_py.core.setpoint import rest_at
+from firmware_py.core.thruster_state import ThrusterFaults
 from firmware_py.core.types import (
     MCU_TIMED_OUT,
     MCU_UNFIT,

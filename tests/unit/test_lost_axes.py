@@ -10,6 +10,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.faults import FaultDetector
 from firmware_py.core.pipeline import BodyPipeline
 from firmware_py.core.rotations import from_euler
+from firmware_py.core.thruster_state import thruster_state
 from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.parameters import Parameters
@@ -104,10 +105,9 @@ def test_passive_axis_that_cannot_be_made_follows_from_the_others(name: str, axi
 @pytest.mark.parametrize(("passive", "lost"), [((), 1), (("sway",), 0)])
 def test_passive_axis_is_not_lost_with_a_thruster(passive: tuple[str, ...], lost: int) -> None:
     """A diagonal horizontal pair of a BlueROV2 Heavy: what is left pushes surge and sway together, so one of them is lost."""
-    detector = FaultDetector(leaving("bluerov2_heavy", *passive), Faults(), TICK_NS)
     usable = np.ones(8, dtype=bool)
     usable[[0, 3]] = False
-    assert detector._state_for(usable).lost_axes == lost
+    assert thruster_state(leaving("bluerov2_heavy", *passive), usable).lost_axes == lost
 
 
 def test_mission_is_planned_without_moment_about_a_passive_axis() -> None:

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from firmware_py.core.body import Body
-from firmware_py.core.faults import STALLED, WHY, FaultDetector
+from firmware_py.core.esc_feedback import STALLED, WHY
+from firmware_py.core.faults import FaultDetector
 from firmware_py.core.names import Place, list_thrusters, name_thruster, places_of
 from firmware_py.core.types import EscFeedback, Event
 from firmware_py.description.failsafe_parameters import Faults
