@@ -6,22 +6,8 @@ import numpy as np
 import pytest
 
 from firmware_py.core import propagation
-from firmware_py.core.missing_thrust import (
-    ACTED,
-    CORIOLIS,
-    CROSSED,
-    FLOW,
-    FORCES,
-    MUNK,
-    RECENT,
-    RESIDUAL,
-    SPEED,
-    MissingThrust,
-    across,
-    add_coriolis,
-    add_flow,
-    add_model,
-)
+from firmware_py.core.missing_thrust import ACTED, CORIOLIS, CROSSED, FLOW, FORCES, MUNK, RECENT, RESIDUAL, SPEED, MissingThrust
+from firmware_py.core.modelled_wrench import across, add_coriolis, add_flow, add_model
 from firmware_py.core.propagation import STATES
 from firmware_py.core.rotations import from_euler
 from firmware_py.core.types import Estimate, Measured
