@@ -15,7 +15,8 @@ import numpy as np
 from firmware_py.bus.codec import Frame
 from firmware_py.core import rotations
 from firmware_py.description.schema import DescriptionError
-from hil.nodes import Mcu, Nodes
+from hil.mcu import Mcu
+from hil.nodes import Nodes
 from hil.plant.camera import Sighting
 from hil.plant.docking import RELAY
 from hil.plant.draw import stream

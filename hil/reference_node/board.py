@@ -6,7 +6,8 @@ import ctypes
 from collections.abc import Sequence
 
 from firmware_py.description.schema import DescriptionError
-from hil.nodes import SLOW, Mcu, Nodes
+from hil.mcu import SLOW, Mcu
+from hil.nodes import Nodes
 from hil.scenario import Scenario
 
 NS_PER_S = 1_000_000_000

@@ -8,7 +8,7 @@ import pytest
 
 from firmware_py.bus.codec import Codec
 from firmware_py.bus.load import MEAN_LIMIT, TICK_LIMIT, bus_load, frame_bits, slow_schedule
-from hil.nodes import _schedule
+from hil.mcu import _schedule
 
 CODEC = Codec.load()
 FLEET = """
