@@ -16,7 +16,8 @@ import serial
 
 from firmware_py.bus.codec import Frame
 from firmware_py.bus.port import PortError, open_port
-from firmware_py.bus.port.links import WAITING_FRAMES, SlcanLink
+from firmware_py.bus.port.links import WAITING_FRAMES
+from firmware_py.bus.port.slcan import SlcanLink
 from tests.unit.ports import FRAMES, UDP, Cable, PortSuite, faults, left_open, no_channel_left_open, poll, receive
 
 __all__ = ["no_channel_left_open"]

@@ -16,17 +16,8 @@ from typing import Any
 import can
 
 from firmware_py.bus.codec import Frame
-from firmware_py.bus.port.links import (
-    WAITING_FRAMES,
-    FrameBus,
-    Link,
-    PortError,
-    SlcanLink,
-    SocketcanLink,
-    UdpLink,
-    VirtualLink,
-    error_number,
-)
+from firmware_py.bus.port.links import WAITING_FRAMES, FrameBus, Link, PortError, SocketcanLink, UdpLink, VirtualLink, error_number
+from firmware_py.bus.port.slcan import SlcanLink
 
 __all__ = ["Port", "PortError", "open_port"]
 
