@@ -11,11 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from firmware_py.core import rotations
+from firmware_py.description.builder import build
 from firmware_py.description.fleet import check_cell, overlaps
 from firmware_py.description.schema import (
     DescriptionError,
     Source,
-    build,
     did_you_mean,
     frozen_array,
     quantity,

@@ -23,7 +23,8 @@ from argument_types import make_room
 from scipy.optimize import nnls
 
 from firmware_py.core.limiter import VOLTAGE_EXPONENT
-from firmware_py.description.schema import DescriptionError, Source, build, describe, did_you_mean, frozen_array, limits_of, read_toml
+from firmware_py.description.builder import build
+from firmware_py.description.schema import DescriptionError, Source, describe, did_you_mean, frozen_array, limits_of, read_toml
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import ThrusterCurve
 from firmware_py.description.vehicle_file import load_vehicle

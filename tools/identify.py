@@ -33,7 +33,8 @@ from rich import box as box_style
 from rich.console import Console
 from rich.table import Table
 
-from firmware_py.description.schema import DescriptionError, build, read_toml
+from firmware_py.description.builder import build
+from firmware_py.description.schema import DescriptionError, read_toml
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import ThrusterCurve, Vehicle
 from firmware_py.description.vehicle_file import load_vehicle

@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 from loop_response import BODIES, Scale, body_of, margins, measure
 
+from firmware_py.description.builder import build
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.schema import DescriptionError, build, did_you_mean, quantity, read_toml, repeated
+from firmware_py.description.schema import DescriptionError, did_you_mean, quantity, read_toml, repeated
 from firmware_py.description.vehicle_file import beside
 from hil.campaign import WALL_CLOCK
 from hil.metrics import SHOWN

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from firmware_py.app.firmware import Firmware, compose
+from firmware_py.description.builder import build
 from firmware_py.description.fleet import Fleet
 from firmware_py.description.parameters import Parameters
-from firmware_py.description.schema import DescriptionError, Source, build
+from firmware_py.description.schema import DescriptionError, Source
 from firmware_py.description.toml_text import to_plain
 from firmware_py.description.vehicle import Vehicle
 from firmware_py.runtime.worker import Worker

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from firmware_py.description.schema import DescriptionError, build, frozen_array, quantity, read_toml, repeated
+from firmware_py.description.builder import build
+from firmware_py.description.schema import DescriptionError, frozen_array, quantity, read_toml, repeated
 from firmware_py.description.vehicle_file import find_vehicles
 
 

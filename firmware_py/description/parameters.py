@@ -9,9 +9,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from firmware_py.description.builder import build
 from firmware_py.description.failsafe_parameters import Failsafes, Faults, Fence
 from firmware_py.description.ground_parameters import Ground
-from firmware_py.description.schema import DescriptionError, Limits, build, describe, did_you_mean, limits_of, quantity, read_toml
+from firmware_py.description.schema import DescriptionError, Limits, describe, did_you_mean, limits_of, quantity, read_toml
 from firmware_py.description.steering_parameters import Steering
 
 

@@ -14,7 +14,7 @@ from firmware_py.description.schema import ANYTHING, Limits, describe, limits_of
 
 
 def to_plain(value: Any) -> Any:
-    """A dataclass as lists, dicts and scalars for JSON; `build` reads them back. Fields that are None are left out."""
+    """A dataclass as lists, dicts and scalars for JSON; `builder.build` reads them back. Fields that are None are left out."""
     if dataclasses.is_dataclass(value):
         items = ((field.name, getattr(value, field.name)) for field in dataclasses.fields(value) if field.init)
         return {name: to_plain(item) for name, item in items if item is not None}

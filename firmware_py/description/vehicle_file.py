@@ -10,10 +10,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from firmware_py.description.builder import build
 from firmware_py.description.schema import (
     DescriptionError,
     Source,
-    build,
     did_you_mean,
     is_file_name,
     is_there,

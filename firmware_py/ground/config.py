@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryFile
 
-from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
+from firmware_py.description.builder import build
+from firmware_py.description.schema import DescriptionError, quantity, read_toml
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.ground.identity import IDENTITIES, Identity
 

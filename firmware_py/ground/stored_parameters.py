@@ -8,8 +8,9 @@ from __future__ import annotations
 from operator import attrgetter
 from pathlib import Path
 
+from firmware_py.description.builder import build
 from firmware_py.description.parameters import Parameters, registry
-from firmware_py.description.schema import build, read_toml
+from firmware_py.description.schema import read_toml
 from firmware_py.description.toml_text import to_plain, to_toml
 
 _FEW = 8

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.description.schema import DescriptionError, Source, build, did_you_mean, parse_toml, quantity, refuse_other_length
+from firmware_py.description.builder import build
+from firmware_py.description.schema import DescriptionError, Source, did_you_mean, parse_toml, quantity, refuse_other_length
 from firmware_py.prepare.minimum_snap import Limits, Waypoint, check_bounded, plan
 from firmware_py.prepare.piecewise import Piecewise
 

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from scipy import constants
 
-from firmware_py.description.schema import DescriptionError, build, read_toml
+from firmware_py.description.builder import build
+from firmware_py.description.schema import DescriptionError, read_toml
 from firmware_py.description.vehicle import ThrusterCurve
 from firmware_py.description.vehicle_file import load_vehicle
 

@@ -19,8 +19,9 @@ import pytest
 from firmware_py.core import rigid_body
 from firmware_py.core.rotations import exp, rotate, rotate_back
 from firmware_py.core.types import BodyPose
+from firmware_py.description.builder import build
 from firmware_py.description.parameters import Estimation
-from firmware_py.description.schema import DescriptionError, build, frozen_array, read_toml
+from firmware_py.description.schema import DescriptionError, frozen_array, read_toml
 from firmware_py.description.toml_text import to_toml
 from firmware_py.description.vehicle import Payload, Vehicle
 from firmware_py.description.vehicle_file import load_vehicle, vehicle_names

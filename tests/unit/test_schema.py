@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.description.schema import DescriptionError, Source, build, describe, frozen_array, limits_of, quantity, read_toml
+from firmware_py.description.builder import build
+from firmware_py.description.schema import DescriptionError, Source, describe, frozen_array, limits_of, quantity, read_toml
 from firmware_py.description.toml_text import to_toml
 
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from firmware_py.core.body import Body
 from firmware_py.core.setpoint import Trajectory
-from firmware_py.description.schema import DescriptionError, build, quantity, read_toml
+from firmware_py.description.builder import build
+from firmware_py.description.schema import DescriptionError, quantity, read_toml
 from firmware_py.prepare import paths
 from firmware_py.prepare.snap_thrust import wrenches
 
