@@ -15,7 +15,8 @@ from firmware_py.core import rotations
 from firmware_py.core.body import Body
 from firmware_py.prepare.piecewise import Piecewise
 from firmware_py.prepare.snap_check import UnreachableError, check, check_standing, check_turns
-from firmware_py.prepare.snap_limits import InfeasibleError, Limits, planes, solve_limited, worst
+from firmware_py.prepare.snap_limits import InfeasibleError, Limits, planes, worst
+from firmware_py.prepare.snap_osqp import solve_limited
 from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
 from firmware_py.prepare.snap_timing import Timed, hastened, stretch_within
 

@@ -12,7 +12,7 @@ import pytest
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
 from firmware_py.description.vehicle_file import load_vehicle
-from firmware_py.prepare import minimum_snap, snap_limits
+from firmware_py.prepare import minimum_snap, snap_osqp
 from firmware_py.prepare.assembly import assemble_vehicle
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, Waypoint, plan
 from firmware_py.prepare.piecewise import Piecewise
@@ -228,7 +228,7 @@ def test_solver_that_gives_up_is_a_limit_that_cannot_be_kept(monkeypatch: pytest
 
 def test_solver_that_runs_out_of_steps_accuses_the_limit_that_is_broken(monkeypatch: pytest.MonkeyPatch) -> None:
     """It then proves nothing; the limit along x, which comes first, is never met."""
-    monkeypatch.setitem(snap_limits._SOLVER, "max_iter", 10)
+    monkeypatch.setitem(snap_osqp._SOLVER, "max_iter", 10)
     waypoints, limits = [Waypoint(p) for p in walk(6)], Limits(velocity=np.array([9.0, 9.0, 0.12]))
     with pytest.raises(InfeasibleError, match=r"keeps the velocity along z within 0.12 m/s .*: OSQP gave up with maximum iterations"):
         plan(waypoints, durations(walk(6)), limits, stretch=False)

@@ -13,7 +13,7 @@ from firmware_py.prepare import minimum_snap
 from firmware_py.prepare.assembly import assemble_vehicle
 from firmware_py.prepare.minimum_snap import InfeasibleError, Limits, UnwantedError, Waypoint, fastest, plan
 from firmware_py.prepare.piecewise import Piecewise
-from firmware_py.prepare.snap_limits import _Problem, solve_limited
+from firmware_py.prepare.snap_osqp import _Problem, solve_limited
 from firmware_py.prepare.snap_timing import MOVED_M, Timed, hastened, stretch_within
 
 SPEED, ACCELERATION = 0.3, 0.1
