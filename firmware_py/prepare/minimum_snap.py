@@ -5,7 +5,6 @@ Paper, "Trajectory Planning for RS-ModCubes" (Mellinger and Kumar 2011), with co
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -14,10 +13,11 @@ import numpy as np
 from firmware_py.core import rotations
 from firmware_py.core.body import Body
 from firmware_py.prepare.piecewise import Piecewise
-from firmware_py.prepare.snap_check import UnreachableError, check, check_standing, check_turns
+from firmware_py.prepare.snap_check import check, check_standing, check_turns
 from firmware_py.prepare.snap_limits import InfeasibleError, Limits, planes, worst
 from firmware_py.prepare.snap_osqp import solve_limited
 from firmware_py.prepare.snap_spline import Knots, System, divide_time, solve
+from firmware_py.prepare.snap_stretch import least_stretched
 from firmware_py.prepare.snap_timing import Timed, hastened, stretch_within
 
 __all__ = ["InfeasibleError", "Limits", "UnwantedError", "Waypoint", "distinct", "fastest", "plan"]
@@ -28,8 +28,6 @@ ATTITUDE_LEVER_M = 0.5
 FIRST_SPEED = 0.1
 """Speed for the initial guess of free durations, m/s; the result does not depend on it."""
 
-_LONGEST_STRETCH = 1024.0
-_STRETCH_TOLERANCE = 2e-3
 _SAME = 1e-6
 """Largest difference, in position (m) and in quaternion, at which waypoints count as equal."""
 
@@ -115,7 +113,8 @@ def _plan(
     free = durations_s is None
     if free:
         check_bounded(waypoints, limits, body)
-    return _fit(lambda factor: replace(request.attempt(base * factor), stretch=factor), free, both_ways=free and request.passes_at_speed())
+    both_ways = free and request.passes_at_speed()
+    return least_stretched(lambda factor: replace(request.attempt(base * factor), stretch=factor), free, both_ways)
 
 
 def fastest(
@@ -153,7 +152,7 @@ def fastest(
             return False
         return True
 
-    return hastened(_fit(lambda factor: request.checked(path.slowed(factor)), free=False), speed_m_s, limits, is_flyable)
+    return hastened(least_stretched(lambda factor: request.checked(path.slowed(factor)), free=False), speed_m_s, limits, is_flyable)
 
 
 def check_bounded(waypoints: Sequence[Waypoint], limits: Limits, body: Body | None = None) -> None:
@@ -187,55 +186,6 @@ def distinct(waypoints: Sequence[Waypoint], same: float = _SAME) -> tuple[list[W
             kept.append(waypoint)
         own.append(len(kept) - 1)
     return kept, own
-
-
-def _fit(attempt: Callable[[float], Piecewise], free: bool, both_ways: bool = False) -> Piecewise:
-    """The trajectory with the smallest feasible stretch of all durations.
-
-    Args:
-        attempt: the trajectory at a stretch; raises InfeasibleError.
-        free: whether the stretch may be below 1.
-        both_ways: whether stretches below 1 may be feasible where none above 1 is.
-    """
-    high, best = _first_feasible(attempt, both_ways)
-    if high == 1.0 and not free:
-        return best
-    low = 0.5 * high if high > 1.0 else high
-    while low == high:
-        shorter = _feasible(attempt, 0.5 * low)
-        if shorter is None:
-            low *= 0.5
-        else:
-            best, low, high = shorter, 0.5 * low, 0.5 * high
-    while high > (1.0 + _STRETCH_TOLERANCE) * low:
-        middle = math.sqrt(low * high)
-        tried = _feasible(attempt, middle)
-        if tried is None:
-            low = middle
-        else:
-            best, high = tried, middle
-    return replace(best, stretch=1.0) if free else best
-
-
-def _first_feasible(attempt: Callable[[float], Piecewise], both_ways: bool) -> tuple[float, Piecewise]:
-    """The first feasible stretch out of 1, 2, 4, ..., or out of 1, 2, 1/2, 4, 1/4, ..., and its trajectory."""
-    factor = 1.0
-    while factor <= _LONGEST_STRETCH:
-        for tried in (factor, 1.0 / factor) if both_ways and factor > 1.0 else (factor,):
-            if (found := _feasible(attempt, tried)) is not None:
-                return tried, found
-        factor *= 2.0
-    return _LONGEST_STRETCH, attempt(_LONGEST_STRETCH)
-
-
-def _feasible(attempt: Callable[[float], Piecewise], factor: float) -> Piecewise | None:
-    """The trajectory at a stretch, or None where it is infeasible but longer durations may help."""
-    try:
-        return attempt(factor)
-    except InfeasibleError as error:
-        if isinstance(error, UnreachableError) and factor >= 1.0:
-            raise
-        return None
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,6 +298,7 @@ class _Request:
         """Raises UnwantedError where the trajectory is no longer wanted."""
         if not self.wanted():
             raise UnwantedError
+
 
 def _check(waypoints: Sequence[Waypoint]) -> None:
     """Refuses too few waypoints, and a velocity where the path rests. Raises ValueError."""
