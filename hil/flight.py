@@ -30,13 +30,14 @@ from hil.force_metrics import force_metrics
 from hil.metrics import PAPER_SPIRAL_RMSE_MM, Poses, flight_metrics, warning_lines
 from hil.plant.fault_spec import FRAME_KINDS
 from hil.plant.spec import Tank
-from hil.plots import PLOTS, Window, write_plots
+from hil.plots import PLOTS, write_plots
 from hil.realtime import fly_in_real_time
 from hil.replaceable import check_alone, check_replaceable, created_folder, is_json_with
 from hil.report import REPORT_FILE, Scene, write_report
 from hil.scenario import Scenario
 from hil.script import Script
 from hil.signals import SIGNAL_LOG, Flight, by_number, period_of, read_flight
+from hil.time_plot import Window
 from hil.truth_log import TRUTH_LOG, is_truth_log
 
 LEFT_BEHIND = (RESULT_FILE, REPORT_FILE, DOCK_PLOT, *(f"{name}.png" for name in PLOTS))

@@ -18,8 +18,8 @@ from firmware_py.description.signals import Columns
 from firmware_py.description.vehicle import Vehicle
 from hil.checks import Result
 from hil.metrics import errors, metric_order, shown, shown_limit, shown_value
-from hil.plots import Window
 from hil.signals import Flight
+from hil.time_plot import Window
 
 REPORT_FILE = "report.html"
 FRAMES_HZ = 25.0

@@ -25,22 +25,12 @@ from hil.flight import _scene, as_wanted, flown_of, wanted_in
 from hil.force_metrics import force_names
 from hil.metrics import SHOWN, flight_metrics, metric_order, shown, shown_limit, shown_value, warning_lines
 from hil.plot_style import GREY, STYLE
-from hil.plots import (
-    JOINED,
-    NOT_JUDGED,
-    Window,
-    _columns_of,
-    attitude,
-    disturbance,
-    estimate,
-    overview,
-    position,
-    thrusters,
-    write_plots,
-)
+from hil.plots import attitude, disturbance, estimate, overview, position, write_plots
 from hil.report import CAPTIONS, Scene, animation, write_report
 from hil.scenario import load_scenario
 from hil.signals import Flight, read_flight
+from hil.thruster_plot import _columns_of, thrusters
+from hil.time_plot import JOINED, NOT_JUDGED, Window
 from tests.unit.flights import START_NS, write_flight, write_pair
 
 TANK_M = np.array([[-0.65, -0.60, 0.0], [0.65, 0.60, 0.76]])
