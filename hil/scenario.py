@@ -34,7 +34,8 @@ from hil.plant.polycube import grow
 from hil.plant.spec import CALM, HALF_A_COUNT, IDEAL, CameraPose, SensorSpec, Tank, WorldSpec
 from hil.plant.world import Start, World
 from hil.scenario_files import scenario_file, scenario_names
-from hil.scenario_rules import idle_keys, mistakes
+from hil.scenario_keys import idle_keys
+from hil.scenario_rules import mistakes
 from hil.starts import places_of, refuse_in_walls, refuse_overlap, starts_of
 
 
