@@ -230,7 +230,7 @@ def _fly_faults(jobs: int, seed: int, out: Path | None) -> int:
         from hil.fault_campaign import run_fault_campaign
         from hil.fault_matrix import print_faults
         from hil.fault_table import ROWS
-        from hil.scenario import MODES
+        from hil.task import MODES
         from hil.workers import processes
 
     with interrupted_once(), campaign_progress("every fault in every mode", len(ROWS) * len(MODES)) as progress:

@@ -15,8 +15,9 @@ from firmware_py.description.fleet import Fleet
 from firmware_py.description.vehicle import FACE_NAMES
 from firmware_py.prepare import paths
 from hil.orders import Orders, heartbeats, is_time_to_arm
-from hil.scenario import Scenario, Step
+from hil.scenario import Scenario
 from hil.script import refuse_outside
+from hil.task import Step
 
 NOBODY = -1
 """Index in place of a module that a step does not have."""

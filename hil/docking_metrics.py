@@ -13,8 +13,9 @@ from firmware_py.description.signals import Columns, read_signals
 from firmware_py.description.vehicle import FACE_NAMES, FACE_NORMALS
 from hil.dock_plot import STAGES
 from hil.metrics import OUTCOMES
-from hil.scenario import Scenario, Step
+from hil.scenario import Scenario
 from hil.signals import SIGNAL_LOG, by_number, rows_of
+from hil.task import Step
 from hil.truth_log import TRUTH_LOG
 
 BELIEVED, TRUE = "/firmware/body", "/plant/body"

@@ -12,7 +12,7 @@ from typing import Any
 
 from firmware_py.description.vehicle import FACE_NAMES
 from hil.plant.fault_spec import Fault
-from hil.scenario import MODES
+from hil.task import MODES
 
 AT_S = 8.0
 """Time of the fault."""

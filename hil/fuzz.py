@@ -16,7 +16,8 @@ from firmware_py.description.vehicle import Vehicle
 from hil.bench import fleet_of
 from hil.nodes import make_nodes
 from hil.plant.draw import stream
-from hil.scenario import MODES, load_scenario, make_world
+from hil.scenario import load_scenario, make_world
+from hil.task import MODES
 
 STOPPING = 0.0002
 """Share of frames with the ids of ESTOP and SYNC. Small, because these stop the robot."""

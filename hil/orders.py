@@ -10,7 +10,7 @@ from firmware_py.description.fleet import Fleet
 from hil.scenario_rules import ARM_FROM_S
 
 if TYPE_CHECKING:
-    from hil.scenario import Task
+    from hil.task import Task
 
 ARM_EVERY_S = 0.5
 """Period of further attempts to arm, until one is granted."""

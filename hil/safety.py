@@ -30,8 +30,9 @@ from hil.orders import Orders
 from hil.plant.draw import stream
 from hil.plant.fault_spec import Fault
 from hil.plant.world import World
-from hil.scenario import MODES, Scenario, load_scenario
+from hil.scenario import Scenario, load_scenario
 from hil.signals import Flight
+from hil.task import MODES
 
 BREAKS_AFTER_S = 10.0
 """Time from the start of the spiral to the fault."""

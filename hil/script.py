@@ -20,8 +20,9 @@ from firmware_py.prepare.assembly import assemble_fleet, check_fleet
 from firmware_py.prepare.minimum_snap import InfeasibleError
 from firmware_py.prepare.waypoints import Mission, line_of, read_mission
 from hil.orders import Orders, is_time_to_arm
-from hil.scenario import Scenario, Task
+from hil.scenario import Scenario
 from hil.starts import hull_levers, in_wall
+from hil.task import Task
 
 MOEBIUS_RAMP_SHARE = 0.25
 """Share of the duration in which the speed rises, and likewise falls: 0.25 keeps the peak at 4/3 of the mean, so drag errors stay small."""

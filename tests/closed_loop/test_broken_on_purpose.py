@@ -19,7 +19,8 @@ from hil.console import print_result
 from hil.flight import judge_logs
 from hil.plant.fault_spec import Fault
 from hil.plant.spec import CameraPose
-from hil.scenario import Step, load_scenario
+from hil.scenario import load_scenario
+from hil.task import Step
 from tests.closed_loop.broken_vehicles import failed, reversed_thruster, turned_tags
 from tests.closed_loop.flights import Corrupt, Fly, Rebuild, shortened
 

@@ -18,7 +18,8 @@ from firmware_py.description.parameters import Parameters
 from firmware_py.runtime.recorder import CAN_LOG, SIGNAL_LOG, Recorder
 from hil.bench import open_bench
 from hil.realtime import fly_in_real_time
-from hil.scenario import Scenario, Step, load_scenario
+from hil.scenario import Scenario, load_scenario
+from hil.task import Step
 from tests.closed_loop.flights import shortened
 
 UDP = f"udp:239.74.163.4:{40_000 + os.getpid() % 20_000}"

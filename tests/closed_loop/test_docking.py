@@ -19,7 +19,8 @@ from firmware_py.prepare.assembly import PITCH_M
 from hil.checks import Result
 from hil.flight import fly_and_judge
 from hil.plant.fault_spec import Fault
-from hil.scenario import Step, load_scenario
+from hil.scenario import load_scenario
+from hil.task import Step
 from tests.closed_loop.flights import Fly
 
 LARGEST_JUMP_N = 1.0

@@ -9,8 +9,9 @@ import pytest
 from firmware_py.description.signals import Columns
 from hil.docking_metrics import DECLARED, FAILED, _docked_rmse_m, _false_declarations, _join_jump_n, docking_metrics, is_as_asked, is_obeyed
 from hil.metrics import OUTCOMES
-from hil.scenario import Scenario, Step, load_scenario
+from hil.scenario import Scenario, load_scenario
 from hil.signals import SIGNAL_LOG
+from hil.task import Step
 from hil.truth_log import TRUTH_LOG
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])

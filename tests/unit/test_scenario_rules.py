@@ -24,11 +24,12 @@ from hil.dock_script import AFTERWARDS_NS, DockScript
 from hil.force_metrics import force_names
 from hil.metrics import DOCKING, SHOWN
 from hil.plant.spec import SensorSpec
-from hil.scenario import Scenario, Step, load_scenario, make_world
+from hil.scenario import Scenario, load_scenario, make_world
 from hil.scenario_files import scenario_names
 from hil.scenario_rules import metric_names
 from hil.script import Script
 from hil.starts import places_of
+from hil.task import Step
 from tests.unit.tanks import FaultyTank
 
 FOLDER = Path(load_scenario.__code__.co_filename).parent / "scenarios"
