@@ -9,8 +9,7 @@ from bench_fleet import PERIOD_NS, cube_of
 
 from firmware_py.bus.codec import Codec, Frame, pack_quaternion
 from firmware_py.bus.mapping import InputCollector
-from firmware_py.core.docking import tag_table
-from firmware_py.core.docking_detector import ModulePoses, PairBank
+from firmware_py.core.docking_detector import ModulePoses, PairBank, tag_table
 from firmware_py.core.joints import joints_of
 from firmware_py.description.fleet import Fleet, Module
 from firmware_py.description.parameters import Docking

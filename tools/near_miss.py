@@ -16,8 +16,7 @@ import numpy as np
 
 from firmware_py.bus.codec import Codec
 from firmware_py.bus.mapping import InputCollector, OutputEncoder
-from firmware_py.core.docking import tag_table
-from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector
+from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector, tag_table
 from firmware_py.core.types import ModuleCommand, Outputs
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle import FACE_NAMES

@@ -11,18 +11,17 @@ from typing import Any
 import numpy as np
 
 from firmware_py.core.body import Body
-from firmware_py.core.docking_decisions import Decisions, Estimated, Join, Part, Prepared
+from firmware_py.core.docking_decisions import Decisions, Estimated, Join, Prepared, body_of, fits
 from firmware_py.core.docking_detector import FacePair, ModulePoses, PairDetector, TagTable
 from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_plan import DockPlan, UndockPlan
 from firmware_py.core.docking_sequence import ENDED, DockingSequence, Stage
 from firmware_py.core.docking_traffic import Dock, Traffic, thirds_of
-from firmware_py.core.docking_way import first_blocking_module, obstacle, plans_conflict, way_of_piece
+from firmware_py.core.docking_way import obstacle, plans_conflict
 from firmware_py.core.joint_watch import JointWatch
 from firmware_py.core.joints import Joint, modules_of
 from firmware_py.core.magnet_relays import MagnetRelays
 from firmware_py.core.names import name_module, name_pair
-from firmware_py.core.rotations import conjugate, multiply, rotate, rotate_back
 from firmware_py.core.setpoint import REST, Wish
 from firmware_py.core.types import (
     INFORMATION,
@@ -180,7 +179,7 @@ class DockingStage:
         decisions: Decisions,
     ) -> None:
         request, plan = prepared.request, prepared.plan
-        mine = _body_of(request.module, estimates)
+        mine = body_of(request.module, estimates)
         if self._expected.get(mine) == request:
             del self._expected[mine]
         under_way = next((dock for dock in self._docks if dock.active == mine), None)
@@ -188,7 +187,7 @@ class DockingStage:
             return
         refusal = self._refusal(prepared, estimates, waiting, holding)
         if plan is None or refusal:
-            what = "undock" if mine == _body_of(request.target_module, estimates) else "dock"
+            what = "undock" if mine == body_of(request.target_module, estimates) else "dock"
             self._say(WARNING, f"{what} refused: {refusal}")
             if under_way is None:
                 self._end(mine, decisions)
@@ -204,16 +203,16 @@ class DockingStage:
         plan = prepared.plan
         if plan is None:
             return prepared.refusal
-        if not _fits(plan, estimates):
+        if not fits(plan, estimates):
             return CHANGED
         if isinstance(plan, UndockPlan):
-            whole = _body_of(plan.opens[0].module, estimates)
+            whole = body_of(plan.opens[0].module, estimates)
             holds = next(iter(self._still_closed(plan)), None)
             newest = self._expected.get(whole)
             if holds is not None and newest is not None and newest.target_module not in estimates[whole][0].modules:
                 return ANOTHER  # a dock, since then
             return "" if holds is None or whole in waiting else HOLDS.format(name_pair(*sorted(modules_of(holds))))
-        mine, others = (_body_of(module, estimates) for module in (plan.request.module, plan.request.target_module))
+        mine, others = (body_of(module, estimates) for module in (plan.request.module, plan.request.target_module))
         if mine not in waiting:
             return NO_LONGER
         if mine in self._expected:
@@ -271,7 +270,7 @@ class DockingStage:
         holding: Collection[int],
     ) -> None:
         request = prepared.request
-        active, target = _body_of(request.module, estimates), _body_of(request.target_module, estimates)
+        active, target = body_of(request.module, estimates), body_of(request.target_module, estimates)
         target_approaches = self._target_approaches(plan, target, holding)
         sequence = DockingSequence(plan, estimates[active][0], estimates[target][0], self._p, time_ns, target_approaches)
         pair = FacePair(request.target_module, request.target_face, request.module, request.face, plan.place_t, plan.q_ta)
@@ -340,12 +339,12 @@ class DockingStage:
 
     def _release(self, undock: Undock, time_ns: int, estimates: Estimated, decisions: Decisions) -> None:
         plan, request = undock.plan, undock.plan.opens[0]
-        if not _fits(plan, estimates):
+        if not fits(plan, estimates):
             self._call_off(undock)
             self._say(WARNING, f"undock ended: {CHANGED}")
             return
         self.relays.switch(RELAY_PUSH, *plan.opens)
-        whole = _body_of(request.module, estimates)
+        whole = body_of(request.module, estimates)
         changes = whole in decisions.joining or whole in [part.whole for part in decisions.parts]
         if changes or undock.pushes(time_ns, self._joints):  # if it changes, the body is gone in the next tick, which ends this undock
             return
@@ -358,19 +357,9 @@ class DockingStage:
             self._end(whole, decisions)
             return
         self.relays.switch(RELAY_OFF, *plan.opens)
-        decisions.parts.append(self._part(undock, whole, estimates))
+        decisions.parts.append(undock.part(whole, estimates, self._p))
         self._undocks.remove(undock)
         self._say(INFORMATION, f"{name_module(request.module)} is undocked from {name_module(request.target_module)}")
-
-    def _part(self, undock: Undock, whole: int, estimates: Estimated) -> Part:
-        """Lets the leaving body glide away; if a third body is in its way, the staying one goes the other way; else neither moves."""
-        (body, at), plan, (stays, leaves) = estimates[whole], undock.plan, undock.pipelines
-        thirds = thirds_of(estimates, whole) if at.placed else []
-        away_w = rotate(at.q_wb, plan.axis_b) * self._p.standoff_m
-        for piece, rest, goes, by_w in ((plan.leaves, stays, leaves, away_w), (plan.stays, leaves, stays, -away_w)):
-            if first_blocking_module(way_of_piece(plan, piece, body, at, by_w), thirds, self._p) is None:
-                return Part(whole, rest, goes, by_w)
-        return Part(whole, stays, leaves, np.zeros(3))
 
     def _call_off(self, undock: Undock) -> None:
         """Ends an undock early: magnets pull again where the joint still exists, and go off where another undock has removed it."""
@@ -381,31 +370,3 @@ class DockingStage:
 
     def _say(self, severity: int, text: str) -> None:
         self.events.append(Event(severity, text))
-
-
-def tag_table(bodies: Sequence[Body]) -> TagTable:
-    """Poses of the tags of every module in its module frame."""
-    table: TagTable = {}
-    for body in bodies:
-        for k, tag in enumerate(body.tag_ids):
-            i = int(body.tag_module[k])
-            q_bm = np.ascontiguousarray(body.q_bm[i])
-            r_mt = rotate_back(q_bm, body.r_bt[k] - body.r_bm[i])
-            q_tm = multiply(conjugate(np.ascontiguousarray(body.q_bt[k])), q_bm)
-            table[body.modules[i], int(tag)] = np.concatenate([r_mt, q_tm])
-    return table
-
-
-def _fits(plan: DockPlan | UndockPlan, estimates: Estimated) -> bool:
-    """Whether the bodies are still those that the plan was made for."""
-    bodies = {frozenset(body.modules) for body, _ in estimates.values()}
-    if isinstance(plan, UndockPlan):
-        return frozenset((*plan.stays.modules, *plan.leaves.modules)) in bodies
-    request, merged = plan.request, frozenset(plan.merged.modules)
-    mine = {module: body for body in bodies for module in body}
-    active, target = mine[request.module], mine[request.target_module]
-    return active != target and active | target == merged
-
-
-def _body_of(module: int, estimates: Estimated) -> int:
-    return next(number for number, (body, _) in estimates.items() if module in body.modules)

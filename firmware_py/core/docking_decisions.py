@@ -1,4 +1,4 @@
-"""Inputs and outputs of the docking stage as values: the worker's answers, and the joins, parts and set-points of a tick."""
+"""Inputs and outputs of the docking stage as values: bodies, the worker's answers, and the joins, parts and set-points of a tick."""
 
 from __future__ import annotations
 
@@ -65,3 +65,19 @@ class Decisions:
     def joining(self) -> set[int]:
         """Bodies that take part in a join of this tick."""
         return {body for join in self.joins for body in (join.active, join.target)}
+
+
+def fits(plan: DockPlan | UndockPlan, estimates: Estimated) -> bool:
+    """Whether the bodies are still those that the plan was made for."""
+    bodies = {frozenset(body.modules) for body, _ in estimates.values()}
+    if isinstance(plan, UndockPlan):
+        return frozenset((*plan.stays.modules, *plan.leaves.modules)) in bodies
+    request, merged = plan.request, frozenset(plan.merged.modules)
+    mine = {module: body for body in bodies for module in body}
+    active, target = mine[request.module], mine[request.target_module]
+    return active != target and active | target == merged
+
+
+def body_of(module: int, estimates: Estimated) -> int:
+    """Number of the body that contains a module."""
+    return next(number for number, (body, _) in estimates.items() if module in body.modules)

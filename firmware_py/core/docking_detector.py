@@ -13,8 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from firmware_py.core.body import Body
 from firmware_py.core.docking_pairs import KEPT, PAIR, PICTURES, Limits, keep_poses, watch
-from firmware_py.core.rotations import to_matrix
+from firmware_py.core.rotations import conjugate, multiply, rotate_back, to_matrix
 from firmware_py.core.types import FACES, NEVER_NS, ModuleInputs
 from firmware_py.description.parameters import Docking
 
@@ -163,3 +164,16 @@ class ModulePoses:
 def _keys(rows: np.ndarray) -> list[tuple[int, ...]]:
     """Returns the fleet indices of the two modules of each row: two modules have at most one pair of faces."""
     return [tuple(pair) for pair in rows["module"].tolist()]
+
+
+def tag_table(bodies: Sequence[Body]) -> TagTable:
+    """Poses of the tags of every module in its module frame."""
+    table: TagTable = {}
+    for body in bodies:
+        for k, tag in enumerate(body.tag_ids):
+            i = int(body.tag_module[k])
+            q_bm = np.ascontiguousarray(body.q_bm[i])
+            r_mt = rotate_back(q_bm, body.r_bt[k] - body.r_bm[i])
+            q_tm = multiply(conjugate(np.ascontiguousarray(body.q_bt[k])), q_bm)
+            table[body.modules[i], int(tag)] = np.concatenate([r_mt, q_tm])
+    return table

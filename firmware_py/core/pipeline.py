@@ -13,7 +13,8 @@ from firmware_py.core.allocator import Allocator
 from firmware_py.core.body import Body
 from firmware_py.core.controller import LAWS
 from firmware_py.core.depth_gate import DepthGate
-from firmware_py.core.docking import DockingStage, tag_table
+from firmware_py.core.docking import DockingStage
+from firmware_py.core.docking_detector import tag_table
 from firmware_py.core.estimator import Estimator
 from firmware_py.core.faults import FaultDetector
 from firmware_py.core.formation import Formation

@@ -7,9 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from firmware_py.core.docking_decisions import Estimated, Part
 from firmware_py.core.docking_pairs import APART
 from firmware_py.core.docking_plan import UndockPlan
+from firmware_py.core.docking_traffic import thirds_of
+from firmware_py.core.docking_way import first_blocking_module, way_of_piece
 from firmware_py.core.joint_watch import JointWatch
+from firmware_py.core.rotations import rotate
 from firmware_py.core.types import DockRequest
 from firmware_py.description.parameters import Docking
 
@@ -60,6 +64,16 @@ class Undock(NamedTuple):
             return IN_PLACE if joints.newest_ns(joint, "near_ns") > half_ns else ""
         pulled = ((before, joints.strong_ma(joint, half_ns)) for joint, before in self.before_ma.items())
         return PULLED if any(a is not None and b is not None and np.all(a * b > 0.0) for a, b in pulled) else ""
+
+    def part(self, whole: int, estimates: Estimated, p: Docking) -> Part:
+        """How the body parts: the leaving piece glides away; if a third body is in its way, the staying one does; else neither moves."""
+        (body, at), plan, (stays, leaves) = estimates[whole], self.plan, self.pipelines
+        thirds = thirds_of(estimates, whole) if at.placed else []
+        away_w = rotate(at.q_wb, plan.axis_b) * p.standoff_m
+        for piece, rest, goes, by_w in ((plan.leaves, stays, leaves, away_w), (plan.stays, leaves, stays, -away_w)):
+            if first_blocking_module(way_of_piece(plan, piece, body, at, by_w), thirds, p) is None:
+                return Part(whole, rest, goes, by_w)
+        return Part(whole, stays, leaves, np.zeros(3))
 
     def _has_picture(self, time_ns: int, joints: JointWatch) -> bool:
         """Whether a picture shows the first joint in the latter half of the push."""
