@@ -58,8 +58,9 @@ own. If a person had chosen the mode before, and the fail-safe did not change it
 another mode while the cause lasts keeps control until the next fail-safe begins; then the gravest one that is on acts.
 
 In MOTOR_DETECT a body is disarmed instead, whatever the action, if a motor test armed it or it never saw a tag: it may lie on a bench. A
-cause that returns before its fail-safe has ended acts again after its delay. A disarmed or stopped body keeps the mode that a person chose;
-after a motor test, a dock or a fail-safe's mode it goes to POSHOLD."""
+cause that returns before its fail-safe has ended acts again after its delay, and so does one that spreads to a further module of the body,
+which is then told of as well. A disarmed or stopped body keeps the mode that a person chose; after a motor test, a dock or a fail-safe's
+mode it goes to POSHOLD."""
 
 ALWAYS = frozenset(Mode).intersection(*(modes for level, modes in PERMITTED.items() if level < Level.DISARM))
 """Modes that no fail-safe forbids: with DISARM there is no armed body to select one."""

@@ -5,7 +5,7 @@ The first row is the gravest. `Failsafes` keeps the timers of each row; the supe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from enum import IntEnum
 from operator import attrgetter
 from typing import NamedTuple
@@ -73,29 +73,31 @@ class Row(NamedTuple):
     """Further modes, in which it counts only if a fail-safe and not a person chose them."""
     warned_modes: frozenset[Mode] = frozenset()
     """Further modes, in which it only warns, whatever its action."""
+    of_modules: Callable[[Health], Mapping[int, float]] = lambda health: {}
+    """The same figure of each module by fleet index. In a body of several those beyond the limit follow in brackets."""
     who: Callable[[Health], str] = lambda health: ""
-    """Names the modules that cause it, in a body of several; follows in brackets."""
+    """Other words that follow in brackets."""
 
 
-def least(*tables: str) -> Callable[[Health], str]:
-    """For `Row.who`: the modules with the least value of all in these tables of ModuleReports: the lowest voltage, or the oldest time."""
-    return lambda health: health.reports.named(min, *tables)
+def told(table: str) -> Callable[[Health], Mapping[int, float]]:
+    """For `Row.of_modules`: what each module last reported, by the name of a table of ModuleReports."""
+    return lambda health: getattr(health.reports, table)
 
 
-def most(*tables: str) -> Callable[[Health], str]:
-    """The same for the largest value."""
-    return lambda health: health.reports.named(max, *tables)
+def age_s(*tables: str) -> Callable[[Health], Mapping[int, float]]:
+    """For `Row.of_modules`: the age of each module's last report, s; of several tables of times that of the oldest."""
+    return lambda health: health.reports.ages_s(health.time_ns, *tables)
 
 
 LASTS = " for {:.1f} s"
 TABLE = (
-    Row("leak", "water in a cabin", "leak", who=most("leak")),
+    Row("leak", "water in a cabin", "leak", of_modules=told("leak")),
     Row("bus_silent", "bus silent", "bus_silent_s", LASTS),
     Row("foreign_sync", "somebody else sends SYNC", "foreign_sync"),
     Row("foreign_command", "somebody else commands modules", "foreign_command"),
-    Row("battery_critical", "battery critical", "voltage_share", ": {:.0%} of its voltage", below=True, who=least("voltage_share")),
-    Row("cabin_hot", "cabin hot", "cabin_c", ": {:.0f} degC", who=most("cabin_c")),
-    Row("cabin_pressure", "cabin pressure off", "cabin_change_pa", " by {:.0f} Pa", who=most("cabin_change_pa")),
+    Row("battery_critical", "battery critical", "voltage_share", ": {:.0%} of its voltage", below=True, of_modules=told("voltage_share")),
+    Row("cabin_hot", "cabin hot", "cabin_c", ": {:.0f} degC", of_modules=told("cabin_c")),
+    Row("cabin_pressure", "cabin pressure off", "cabin_change_pa", " by {:.0f} Pa", of_modules=told("cabin_change_pa")),
     Row("axis_lost", "the thrusters left cannot make every wrench", "lost_axes"),
     Row("attitude_lost", "attitude not held", "attitude_off_deg", ": {:.0f} deg off", modes=UPRIGHT),
     Row("depth_unknown", "depth unknown", "depth_unknown_s", LASTS, modes=PLACED | {Mode.ALT_HOLD}),
@@ -108,9 +110,12 @@ TABLE = (
     Row("tag_late", "no tag", "tag_age_s", LASTS, modes=MOVING),
     Row("depth_lost", "no pressure", "depth_age_s", LASTS),
     Row("imu_lost", "no IMU", "imu_age_s", LASTS),
-    Row("sensor_lost", "a module of several has no IMU or no pressure", "sensor_age_s", LASTS, who=least("imu_ns", "pressure_ns")),
-    Row("module_silent", "a module is silent", "silent_s", LASTS, who=least("hears_ns")),
-    Row("module_late", "a module answers too late, or for another tick", "any_late", who=lambda health: name_modules(health.late)),
+    Row("sensor_lost", "a module of several has no IMU or no pressure", "sensor_age_s", LASTS, of_modules=age_s("imu_ns", "pressure_ns")),
+    Row("module_silent", "a module is silent", "silent_s", LASTS, of_modules=age_s("hears_ns")),
+    Row(
+        "module_late", "a module answers too late, or for another tick", "any_late",
+        of_modules=lambda health: dict.fromkeys(health.late, 1.0),
+    ),
     Row("estop_box_silent", "e-stop box silent", "estop_box_age_s", LASTS),
     Row("ticks_missed", "ticks missed", "missed_percent", ": {:.0f}% of them"),
     Row("fence", "outside the fence", "outside_m", " by {:.2f} m", modes=MOVING, forced_modes=frozenset({Mode.ALT_HOLD})),
@@ -118,23 +123,23 @@ TABLE = (
     Row("ground_lost", "ground station silent", "ground_age_s", LASTS, modes=ANY - {Mode.AUTO, Mode.SURFACE}),
     Row("pilot_lost", "pilot silent", "pilot_age_s", LASTS, modes=PILOTED),
     Row("thruster_lost", "a thruster is out", "thruster_lost"),
-    Row("cabin_unknown", "no reading of a cabin", "cabin_age_s", LASTS, who=least("cabin_ns")),
-    Row("battery_unknown", "no reading of a battery", "battery_age_s", LASTS, who=least("battery_ns")),
-    Row("battery_low", "battery low", "voltage_share", ": {:.0%} of its voltage", below=True, who=least("voltage_share")),
-)
+    Row("cabin_unknown", "no reading of a cabin", "cabin_age_s", LASTS, of_modules=age_s("cabin_ns")),
+    Row("battery_unknown", "no reading of a battery", "battery_age_s", LASTS, of_modules=age_s("battery_ns")),
+    Row("battery_low", "battery low", "voltage_share", ": {:.0%} of its voltage", below=True, of_modules=told("voltage_share")),
+)  # fmt: skip
 get_figures = attrgetter(*(row.figure for row in TABLE))
 """Returns the figure of every row, from the health of a tick."""
 
 
 class Alarm(NamedTuple):
-    """Report of a fail-safe that has just begun, recurred or ended."""
+    """Report of a fail-safe that has just begun, spread to another module, recurred or ended."""
 
     name: str
     words: str
     level: Level
     begins: bool
     again: bool = False
-    """Whether its cause came back before it had ended."""
+    """Whether its cause came back before it had ended, in no other module than before."""
 
 
 class Watch:
@@ -150,7 +155,11 @@ class Watch:
         self.acts_as = Level.NONE
         """Its action in the present mode, kept up while it is active or its cause lasts."""
         self.began = ""
-        """Its text when it last began."""
+        """Its text when it was last told."""
+        self._bad_ns: dict[int, int] = {}
+        """By fleet index: since when the cause has been in a module."""
+        self._named: set[int] = set()
+        """Modules with the cause that its texts have named since it began."""
         self.retune(parameters)
 
     def retune(self, parameters: FailsafeParameters) -> None:
@@ -170,6 +179,7 @@ class Watch:
         on = [watch for watch in before if watch.active]
         self.active, self.began = bool(on), next((watch.began for watch in on), "")
         self.acts_as = max((watch.acts_as for watch in on), default=self.level)
+        self._named = set().union(*(watch._named for watch in on))
         self._since_ns = min((watch._since_ns for watch in before if watch._since_ns is not None), default=None)
         self._told_ns = self._since_ns if on and all(watch._told_ns == watch._since_ns for watch in on) else None
 
@@ -199,9 +209,28 @@ class Watch:
     def words(self, health: Health) -> str:
         """Returns its text with the present value."""
         value = getattr(health, self.row.figure)
-        who = self.row.who(health) if health.reports.is_of_several else ""
+        bad = self._bad_modules(health)
+        who = (name_modules(bad) if bad else self.row.who(health)) if health.reports.is_of_several else ""
         detail = "" if value >= NEVER_S else self.row.detail.format(value)
         return f"{self.row.words}{detail}{who and f' ({who})'}"
+
+    def _bad_modules(self, health: Health) -> list[int]:
+        """Returns the fleet indices of the modules whose own figure is beyond the limit now."""
+        return sorted(module for module, value in self.row.of_modules(health).items() if self.is_bad(value))
+
+    def tell(self, health: Health) -> str:
+        """Returns its text, and remembers it and the modules that it names."""
+        self.began = self.words(health)
+        self._named.update(self._bad_modules(health))
+        return self.began
+
+    def spreads(self, health: Health, cause: bool) -> bool:
+        """Whether the cause has been for the delay in a module that no text has named since it began. Runs before `step`."""
+        now = health.time_ns
+        self._bad_ns = {module: self._bad_ns.get(module, now) for module in self._bad_modules(health)} if cause else {}
+        if not self.active:
+            self._named.clear()
+        return self.active and any(now - at >= self._delay_ns for module, at in self._bad_ns.items() if module not in self._named)
 
     def ending(self, health: Health, mode: Mode, armed: bool) -> str:
         """Returns its text when it ends: what has cleared; or that the cause lasts but no longer counts in this mode or while disarmed."""
@@ -261,11 +290,11 @@ class Failsafes:
                 continue
             was_active = watch.active
             watch.enter(mode)
-            if watch.step(health.time_ns, cause, armed):
-                again = was_active and watch.active
-                words = watch.words(health) if watch.active else watch.ending(health, mode, armed)
+            spreads = watch.spreads(health, cause)
+            if watch.step(health.time_ns, cause, armed) or spreads:
+                again = was_active and watch.active and not spreads
+                words = watch.tell(health) if watch.active else watch.ending(health, mode, armed)
                 alarms.append(Alarm(watch.row.name, words, watch.acts_as, watch.active, again))
-                watch.began = words if watch.active else watch.began
         return alarms
 
     @property

@@ -1,10 +1,9 @@
-"""Last report of each module of a body, kept by `health_monitor`; names the modules behind a figure of `health`."""
+"""Last report of each module of a body, kept by `health_monitor`; tells the modules behind a figure of `health`."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 
-from firmware_py.core.names import name_modules
 from firmware_py.core.types import NEVER_NS
 
 
@@ -30,8 +29,9 @@ class ModuleReports:
         """Whether the body has several modules, so that a text must say which one it means."""
         return len(self.heard_ns) > 1
 
-    def named(self, pick: Callable[[Iterable[float]], float], *tables: str) -> str:
-        """Names the modules whose value is the worst of all in these tables, which `pick` (min or max) finds."""
-        told = [(module, value) for table in tables for module, value in getattr(self, table).items()]
-        worst = pick(value for _, value in told)
-        return name_modules(sorted({module for module, value in told if value == worst}))
+    def ages_s(self, now_ns: int, *tables: str) -> dict[int, float]:
+        """Returns the age of each module's last report, s; of several tables of times that of the oldest."""
+        ages: dict[int, float] = {}
+        for table in tables:
+            ages |= {module: max((now_ns - at_ns) * 1e-9, ages.get(module, 0.0)) for module, at_ns in getattr(self, table).items()}
+        return ages

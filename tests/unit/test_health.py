@@ -661,6 +661,39 @@ def test_fail_safe_names_the_modules_behind_it_in_a_body_of_several(name: str) -
     assert [text.partition(" (")[2] for text in words] == ["module 4)", "", "module 2)", "", "module 2, 4)", ""]
 
 
+@pytest.mark.parametrize("name", UNWELL)
+def test_fail_safe_that_spreads_to_another_module_is_told_again_once_and_only_after_its_delay(name: str) -> None:
+    """Regression: water in a second cabin was told of nowhere, nor was the second battery, sensor or silent module."""
+    bench, failsafes, unwell = MonitorBench(), Failsafes(Parameters().failsafes), dataclasses.replace(WELL, **UNWELL[name])
+    told: list[tuple[str, bool]] = []
+
+    def run(one: ModuleInputs, three: ModuleInputs, ticks: int) -> None:
+        for _ in range(ticks):
+            alarms = failsafes.step(bench.step(one, three), Mode.POSHOLD, False, True)
+            told.extend((alarm.words.partition(" (")[2], alarm.again) for alarm in alarms if alarm.begins and alarm.name == name)
+
+    run(WELL, WELL, 10)
+    run(unwell, WELL, 1000)
+    run(unwell, unwell, 1)
+    assert told == [("module 2)", False)], "one bad reading of another module does not count"
+    run(unwell, unwell, 1000)
+    assert told[1:] == [("module 2, 4)", False)]
+    run(unwell, WELL, 1000)
+    run(unwell, unwell, 1000)
+    assert len(told) == 2, "a module that the texts have named is not told of again"
+
+
+def test_modules_that_lost_different_sensors_at_different_times_are_all_named() -> None:
+    bench, watch = MonitorBench(), Watch(next(row for row in TABLE if row.name == "sensor_lost"), Parameters().failsafes)
+    bench.step(WELL, WELL)
+    without_imu, without_pressure = dataclasses.replace(WELL, gyro=None), dataclasses.replace(WELL, pressure_pa=None)
+    for _ in range(200):
+        bench.step(without_imu, WELL)
+    for _ in range(200):
+        health = bench.step(without_imu, without_pressure)
+    assert watch.words(health).endswith(" for 4.0 s (module 2, 4)")
+
+
 def test_body_inherits_every_report_of_its_modules_and_of_no_other() -> None:
     """A figure of a module that is added to ModuleReports needs no second place: forgotten there, it began anew at every dock."""
     pair, one = ModuleReports([1, 3]), ModuleReports([3])

@@ -6,6 +6,7 @@ import pytest
 
 from firmware_py.core.failsafes import Level
 from firmware_py.core.health import Health
+from firmware_py.core.module_reports import ModuleReports
 from firmware_py.core.supervisor import Decision, Supervisor
 from firmware_py.core.transitions import Effect, State, Trigger
 from firmware_py.core.types import CRITICAL, INFORMATION, WARNING, Action, Event, Mode, Request
@@ -63,6 +64,18 @@ def test_lost_partner_keeps_from_docking_and_not_from_letting_it_go(bad: Health,
         decisions = ask(supervisor, action, DOCK, bad)
         refusals = [text for text in texts(supervisor) if text.startswith(f"{action.name} refused: {why}")]
         assert len(refusals) == 1 if why else decisions[0].mode == Mode.DOCK
+
+
+def test_fail_safe_that_spreads_to_another_module_takes_the_robot_again() -> None:
+    supervisor, reports = supervisor_in(mode=Mode.AUTO, parameters=QUICK), ModuleReports([0, 1])
+    wet = GOOD._replace(leak=True, reports=reports)
+    reports.leak[0] = True
+    supervisor.step(False, wet, [])
+    ask(supervisor, Action.SET_MODE, Mode.MANUAL, at(wet, 1))
+    reports.leak[1] = True
+    assert [decision.trigger for decision in supervisor.step(False, at(wet, 2), [])] == [Trigger.FAILSAFE_SURFACE]
+    assert texts(supervisor) == ["fail-safe on: water in a cabin (module 1, 2)", "ARMED MANUAL -> ARMED SURFACE"]
+    assert supervisor.step(False, at(wet, 3), []) == [] == supervisor.events
 
 
 def test_milder_fail_safe_does_not_undo_a_graver() -> None:
