@@ -203,8 +203,12 @@ class FaultDetector:
             self.changed = True
             self._motion.forget()
             silent = name_modules(self._modules[i] for i in self._silent)
-            less = bool((self.now.alive < self._obeys).any())
-            self.words.append(f"thrusters of silent {silent} are left out" if less else "thrusters of every module are used again")
+            if (self.now.alive < self._obeys).any():
+                self.words.append(f"thrusters of silent {silent} are left out")
+            elif self._silent:
+                self.words.append(f"thrusters of silent {silent} are used blindly: the others cannot make every wrench")
+            else:
+                self.words.append("thrusters of every module are used again")
 
     def _usable_state(self) -> ThrusterFaults:
         """Returns the fault state: all thrusters that obey, without those of silent modules where the others have the same rank."""
