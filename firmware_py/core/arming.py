@@ -118,8 +118,17 @@ def _failsafes(q: Question) -> list[str]:
 
 def _readings(q: Question) -> list[str]:
     limits, health = q.parameters.failsafes, q.health
-    ages = {"battery": (health.battery_age_s, limits.battery_unknown_limit), "cabin": (health.cabin_age_s, limits.cabin_unknown_limit)}
-    return [f"{name} was not heard of lately" for name, (age_s, permitted_s) in ages.items() if age_s > permitted_s]
+    kinds = (
+        ("battery", health.battery_age_s, limits.battery_unknown_limit, "battery_ns"),
+        ("cabin", health.cabin_age_s, limits.cabin_unknown_limit, "cabin_ns"),
+    )
+    return [f"{name}{_of_older(health, table, most_s)} was not heard of lately" for name, age_s, most_s, table in kinds if age_s > most_s]
+
+
+def _of_older(health: Health, table: str, most_s: float) -> str:
+    """Returns, in a body of several, which modules have an older report in this table of ModuleReports: " of module 2"."""
+    older = sorted(module for module, age_s in health.reports.ages_s(health.time_ns, table).items() if age_s > most_s)
+    return f" of {name_modules(older)}" if health.reports.is_of_several else ""
 
 
 def _frames(q: Question) -> str:

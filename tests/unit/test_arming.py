@@ -12,6 +12,7 @@ from firmware_py.core.arming import CHECKS, Question, against_arming, missing
 from firmware_py.core.body import axes_without_thrust
 from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.health import NEVER_S, Health
+from firmware_py.core.module_reports import ModuleReports
 from firmware_py.core.names import Place
 from firmware_py.core.transitions import State
 from firmware_py.core.types import Action, DockRequest, Mode, Request
@@ -296,6 +297,15 @@ def test_vehicle_with_an_axis_that_nothing_pushes_or_rights_is_not_armed(name: s
 def test_no_shipped_vehicle_lacks_thrust(name: str) -> None:
     body = assemble_vehicle(load_vehicle(name))
     assert axes_without_thrust(body.thrusters.matrix, body.passive) == ()
+
+
+def test_modules_whose_battery_and_cabin_are_unknown_are_named_in_a_body_of_several() -> None:
+    """Regression: of four docked modules it was said that the battery was not heard of, and not which."""
+    reports = ModuleReports([0, 2, 5])
+    reports.battery_ns |= {0: GOOD.time_ns, 5: GOOD.time_ns}
+    reports.cabin_ns |= {0: GOOD.time_ns}
+    found = reasons(GOOD._replace(battery_age_s=NEVER_S, cabin_age_s=NEVER_S, reports=reports))
+    assert found == ["battery of module 3 was not heard of lately", "cabin of module 3, 6 was not heard of lately"]
 
 
 def test_every_axis_that_lacks_thrust_is_named_once_and_only_those() -> None:
