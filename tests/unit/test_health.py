@@ -683,6 +683,18 @@ def test_fail_safe_that_spreads_to_another_module_is_told_again_once_and_only_af
     assert len(told) == 2, "a module that the texts have named is not told of again"
 
 
+def test_body_that_is_made_of_another_does_not_tell_again_of_the_modules_that_were_named() -> None:
+    bench, failsafes, whole = MonitorBench(), Failsafes(Parameters().failsafes), Failsafes(Parameters().failsafes)
+    dry, wet = here(leak=False), here(leak=True)
+    for one, three in ((dry, dry), *[(wet, dry)] * 100):
+        failsafes.step(bench.step(one, three), Mode.POSHOLD, False, True)
+    whole.take_over([failsafes])
+    alarms = [alarm for _ in range(100) for alarm in whole.step(bench.step(wet, dry), Mode.POSHOLD, False, True) if alarm.name == "leak"]
+    assert alarms == []
+    alarms = [alarm for _ in range(100) for alarm in whole.step(bench.step(wet, wet), Mode.POSHOLD, False, True) if alarm.name == "leak"]
+    assert [alarm.words for alarm in alarms] == ["water in a cabin (module 2, 4)"]
+
+
 def test_modules_that_lost_different_sensors_at_different_times_are_all_named() -> None:
     bench, watch = MonitorBench(), Watch(next(row for row in TABLE if row.name == "sensor_lost"), Parameters().failsafes)
     bench.step(WELL, WELL)
