@@ -114,7 +114,7 @@ TABLE = (
     Row("module_silent", "a module is silent", "silent_s", LASTS, of_modules=age_s("hears_ns")),
     Row(
         "module_late", "a module answers too late, or for another tick", "any_late",
-        of_modules=lambda health: dict.fromkeys(health.late, 1.0),
+        of_modules=lambda health: dict.fromkeys(health.late, True),
     ),
     Row("estop_box_silent", "e-stop box silent", "estop_box_age_s", LASTS),
     Row("ticks_missed", "ticks missed", "missed_percent", ": {:.0f}% of them"),

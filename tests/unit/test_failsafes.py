@@ -7,6 +7,7 @@ import pytest
 
 from firmware_py.core.failsafes import ANY, FREE, MOVING, PERMITTED, PILOTED, PLACED, TABLE, Alarm, Failsafes, Level, Row, Watch
 from firmware_py.core.health import UNSEEN_S, Health
+from firmware_py.core.module_reports import ModuleReports
 from firmware_py.core.types import Mode
 from firmware_py.description.failsafe_parameters import Failsafes as Parameters
 from firmware_py.ground import mission_items
@@ -377,6 +378,45 @@ def test_body_that_takes_over_goes_on_with_every_fail_safe_and_its_time() -> Non
     assert after.step(at(both, 1.0), Mode.AUTO, False, True) == [], "told already"
     assert [alarm.name for alarm in after.step(at(both, 4.99), Mode.AUTO, False, True)] == []
     assert [alarm.name for alarm in after.step(at(both, 5.0), Mode.AUTO, False, True)] == ["battery_critical", "battery_low"]
+
+
+def leaking(seconds: float, *modules: int) -> Health:
+    """A body of modules 0, 1 and 2 with water in the cabins of `modules`."""
+    reports = ModuleReports([0, 1, 2])
+    reports.leak |= dict.fromkeys(modules, True)
+    return at(GOOD._replace(leak=bool(modules), reports=reports), seconds)
+
+
+LEAK = replace(quick("leak"), leak_delay_s=1.0, leak_latched=0)
+
+
+def told_of(failsafes: Failsafes, *healths: Health) -> list[str]:
+    alarms = [alarm for health in healths for alarm in failsafes.step(health, Mode.AUTO, False, True)]
+    return [alarm.words for alarm in alarms if alarm.begins and not alarm.again]
+
+
+def test_fail_safe_that_spreads_to_a_module_is_told_once_it_has_been_there_for_the_delay() -> None:
+    failsafes = Failsafes(LEAK)
+    assert told_of(failsafes, leaking(0.0, 0), leaking(1.0, 0)) == ["water in a cabin (module 1)"]
+    assert told_of(failsafes, leaking(1.5, 0, 1), leaking(2.5 - 1e-9, 0, 1)) == []
+    assert told_of(failsafes, leaking(2.5, 0, 1), leaking(9.0, 0, 1)) == ["water in a cabin (module 1, 2)"]
+    assert told_of(failsafes, leaking(10.0, 0, 1, 2), leaking(10.5, 0, 1), leaking(10.9, 0, 1, 2), leaking(11.8, 0, 1, 2)) == []
+    assert told_of(failsafes, leaking(11.9, 0, 2)) == ["water in a cabin (module 1, 3)"]
+
+
+def test_fail_safe_that_ended_names_its_modules_anew() -> None:
+    failsafes = Failsafes(LEAK)
+    assert told_of(failsafes, leaking(0.0, 0), leaking(1.0, 0), leaking(2.0), leaking(2.0 + P.clear_s)) == ["water in a cabin (module 1)"]
+    assert told_of(failsafes, leaking(20.0, 1), leaking(21.0, 1)) == ["water in a cabin (module 2)"]
+    assert told_of(failsafes, leaking(22.0, 0, 1), leaking(23.0, 0, 1)) == ["water in a cabin (module 1, 2)"]
+
+
+def test_body_that_takes_over_names_no_module_again() -> None:
+    before, after = Failsafes(LEAK), Failsafes(LEAK)
+    assert told_of(before, leaking(0.0, 0), leaking(1.0, 0))
+    after.take_over([before])
+    assert told_of(after, leaking(2.0, 0), leaking(4.0, 0)) == []
+    assert told_of(after, leaking(5.0, 0, 1), leaking(6.0, 0, 1)) == ["water in a cabin (module 1, 2)"]
 
 
 def test_fail_safe_that_never_began_has_nothing_to_say() -> None:
