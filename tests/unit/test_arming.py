@@ -302,7 +302,8 @@ def test_no_shipped_vehicle_lacks_thrust(name: str) -> None:
 def test_modules_whose_battery_and_cabin_are_unknown_are_named_in_a_body_of_several() -> None:
     """Regression: of four docked modules it was said that the battery was not heard of, and not which."""
     reports = ModuleReports([0, 2, 5])
-    reports.battery_ns |= {0: GOOD.time_ns, 5: GOOD.time_ns}
+    permitted_ns = round(P.failsafes.battery_unknown_limit * 1e9)
+    reports.battery_ns |= {0: GOOD.time_ns, 2: GOOD.time_ns - permitted_ns - 1, 5: GOOD.time_ns - permitted_ns}
     reports.cabin_ns |= {0: GOOD.time_ns}
     found = reasons(GOOD._replace(battery_age_s=NEVER_S, cabin_age_s=NEVER_S, reports=reports))
     assert found == ["battery of module 3 was not heard of lately", "cabin of module 3, 6 was not heard of lately"]

@@ -404,6 +404,11 @@ def test_fail_safe_that_spreads_to_a_module_is_told_once_it_has_been_there_for_t
     assert told_of(failsafes, leaking(11.9, 0, 2)) == ["water in a cabin (module 1, 3)"]
 
 
+def test_modules_that_answer_late_are_named() -> None:
+    late = leaking(0.0)._replace(late=(0, 2))
+    assert told_of(Failsafes(quick("module_late")), late) == ["a module answers too late, or for another tick (module 1, 3)"]
+
+
 def test_fail_safe_that_ended_names_its_modules_anew() -> None:
     failsafes = Failsafes(LEAK)
     assert told_of(failsafes, leaking(0.0, 0), leaking(1.0, 0), leaking(2.0), leaking(2.0 + P.clear_s)) == ["water in a cabin (module 1)"]
