@@ -215,7 +215,6 @@ def test_pair_that_docks_is_to_touch_and_a_third_body_is_not() -> None:
     assert pair(moving, waiting, ((0, 7), (7, 5)))[0] > 0.0
 
 
-@pytest.mark.slow
 def test_body_out_of_sight_keeps_others_farther_off() -> None:
     """It counted for minutes as exactly where its last tag was, and a body swam into where a current had carried it."""
     moving = at(ZERO, [0.2, 0.0, 0.0])
