@@ -333,5 +333,6 @@ class MissionFlight:
     def _first(self) -> int:
         return self._system.subject.identity.first_item
 
+
 def _no_speed(speed_m_s: float) -> str:
     return f"a speed of {speed_m_s:g} m/s; it needs {SLOWEST:g} to {FASTEST:g}"
