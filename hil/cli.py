@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from firmware_py.description.parameters import CONTROLLERS, Parameters, load_parameters
-from firmware_py.description.schema import DescriptionError, Source, did_you_mean, read_toml
+from firmware_py.description.schema import DescriptionError, Source, read_toml, unknown_name
 from firmware_py.runtime.folders import folder_of
 from firmware_py.runtime.interrupts import ended_at_once, interrupted_once
 from firmware_py.runtime.recorder import CAN_LOG
@@ -40,9 +40,7 @@ def parameters_of(controller: str) -> Parameters:
     if controller.endswith(".toml"):
         return load_parameters(Path(controller))
     if controller not in CONTROLLERS:
-        known = ", ".join(CONTROLLERS)
-        question = did_you_mean(controller, CONTROLLERS)
-        raise DescriptionError(f"controller {controller!r} is unknown; {question}there are {known}, or give a .toml file")
+        raise unknown_name("controller", controller, tuple(CONTROLLERS))
     return CONTROLLERS[controller]
 
 

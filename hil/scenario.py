@@ -16,12 +16,11 @@ from firmware_py.description.fleet import check_cell, overlaps
 from firmware_py.description.schema import (
     DescriptionError,
     Source,
-    did_you_mean,
     frozen_array,
     quantity,
     read_text,
     read_toml,
-    refuse_folder,
+    unknown_name,
 )
 from firmware_py.description.vehicle_file import find_vehicles, load_vehicle
 from hil.checks import UNBOUNDED
@@ -223,9 +222,7 @@ def load_scenario(name: str) -> Scenario:
     elif name in scenario_names():
         path = scenario_file(name)
     else:
-        refuse_folder(name)
-        question, known = did_you_mean(name, scenario_names()), ", ".join(scenario_names())
-        raise DescriptionError(f"scenario {name!r} is unknown; {question}there are {known}, or give a .toml file")
+        raise unknown_name("scenario", name, scenario_names())
     table, source = read_toml(path)
     scenario: Scenario = build(Scenario, table, source)
     scenario = dataclasses.replace(scenario, module=find_vehicles(scenario.module, source))

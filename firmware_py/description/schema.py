@@ -191,10 +191,11 @@ def is_there(path: Path, look: Callable[[Path], bool] = Path.exists) -> bool:
         return False
 
 
-def refuse_folder(name: str) -> None:
-    """Raises DescriptionError if `name`, which should be a shipped name or a file, is a folder."""
+def unknown_name(kind: str, name: str, known: Sequence[str]) -> DescriptionError:
+    """The error of a `name` that is neither one of the `known` names of a `kind` of thing nor a .toml file."""
     if is_there(Path(name), Path.is_dir):
-        raise DescriptionError(f"{name}: is a folder; give a .toml file")
+        return DescriptionError(f"{name}: is a folder; give a .toml file")
+    return DescriptionError(f"{kind} {name!r} is unknown; {did_you_mean(name, known)}there are {', '.join(known)}, or give a .toml file")
 
 
 def did_you_mean(word: str, known: Iterable[str]) -> str:

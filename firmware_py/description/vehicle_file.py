@@ -14,13 +14,12 @@ from firmware_py.description.builder import build
 from firmware_py.description.schema import (
     DescriptionError,
     Source,
-    did_you_mean,
     is_file_name,
     is_there,
     limits_of,
     read_toml,
-    refuse_folder,
     repeated,
+    unknown_name,
 )
 from firmware_py.description.vehicle import AXES, MOST_OVER_HULL, MOST_THRUSTERS, Drag, Vehicle, too_many_thrusters
 
@@ -52,9 +51,7 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
     elif name in vehicle_names():
         path = Path(str(resources.files("firmware_py") / "vehicles" / f"{name}.toml"))
     else:
-        refuse_folder(name)
-        question, known = did_you_mean(name, vehicle_names()), ", ".join(vehicle_names())
-        raise DescriptionError(f"vehicle {name!r} is unknown; {question}there are {known}, or give a .toml file")
+        raise unknown_name("vehicle", name, vehicle_names())
     table, source = read_toml(path)
     vehicle: Vehicle = build(Vehicle, table, source)
     _check_body(vehicle, source)
