@@ -209,13 +209,16 @@ class Watch:
     def words(self, health: Health) -> str:
         """Returns its text with the present value."""
         value = getattr(health, self.row.figure)
-        bad = self._bad_modules(health)
-        who = (name_modules(bad) if bad else self.row.who(health)) if health.reports.is_of_several else ""
+        who = self.row.who(health) if health.reports.is_of_several else ""
+        if bad := self._bad_modules(health):
+            who = name_modules(bad)
         detail = "" if value >= NEVER_S else self.row.detail.format(value)
         return f"{self.row.words}{detail}{who and f' ({who})'}"
 
     def _bad_modules(self, health: Health) -> list[int]:
-        """Returns the fleet indices of the modules whose own figure is beyond the limit now."""
+        """Returns, in a body of several, the fleet indices of the modules whose own figure is beyond the limit now."""
+        if not health.reports.is_of_several:
+            return []
         return sorted(module for module, value in self.row.of_modules(health).items() if self.is_bad(value))
 
     def tell(self, health: Health) -> str:

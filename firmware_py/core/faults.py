@@ -19,7 +19,7 @@ from firmware_py.core.esc_feedback import ESC_DOWN, ESC_FAILED, FAST_MARGIN, FAS
 from firmware_py.core.missing_thrust import MissingThrust
 from firmware_py.core.names import name_modules, name_thruster, places_of
 from firmware_py.core.thruster import polynomial
-from firmware_py.core.thruster_state import ThrusterFaults, thruster_state
+from firmware_py.core.thruster_state import ThrusterFaults, steered_rank, thruster_state
 from firmware_py.core.topology import in_both
 from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
@@ -58,7 +58,7 @@ class FaultDetector:
     def __init__(self, body: Body, parameters: Faults, period_ns: int) -> None:
         t = body.thrusters
         self._t = t
-        self._body = body
+        self._body, self._rank = body, steered_rank(t.matrix, body.passive)
         self._thruster_at = by_channel(body)
         self._pair_at = [{c: (at.get(c, -1), at.get(c + 1, -1)) for c in range(max(at) + 1)} for at in self._thruster_at]
         """Per module and first channel of an ESC feedback: the indices of its two thrusters, -1 where there is none."""
@@ -96,7 +96,7 @@ class FaultDetector:
         """Messages of this tick, for people."""
         self.changed = False
         """Whether `now` changed in this tick."""
-        self.now = thruster_state(self._body, self._obeys)
+        self.now = self._state_of(self._obeys)
 
     def retune(self, parameters: Faults) -> None:
         """Applies new limits from this tick on; known faults stay."""
@@ -125,7 +125,7 @@ class FaultDetector:
         self._motion.reset()
         self.changed = not self.now.alive.all()
         self._obeys[:], self._silent, self._well = True, [], {}
-        self.now = thruster_state(self._body, self._obeys)
+        self.now = self._state_of(self._obeys)
 
     def step(
         self,
@@ -210,12 +210,15 @@ class FaultDetector:
             else:
                 self.words.append("thrusters of every module are used again")
 
+    def _state_of(self, usable: np.ndarray) -> ThrusterFaults:
+        return thruster_state(self._body, usable, self._rank)
+
     def _usable_state(self) -> ThrusterFaults:
         """Returns the fault state: all thrusters that obey, without those of silent modules where the others have the same rank."""
-        obeying = thruster_state(self._body, self._obeys)
+        obeying = self._state_of(self._obeys)
         if not self._silent:
             return obeying
-        without = thruster_state(self._body, self._obeys & ~np.isin(self._t.module, self._silent))
+        without = self._state_of(self._obeys & ~np.isin(self._t.module, self._silent))
         return without._replace(dead=obeying.dead) if without.lost_axes == obeying.lost_axes else obeying
 
     def _judge_feedback(self, feedbacks: list[list[EscFeedback]], force_n: np.ndarray) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,16 +29,21 @@ class ThrusterFaults(NamedTuple):
     """(2,) that of the usable thrusters, as Body.deceleration."""
 
 
-def thruster_state(body: Body, usable: np.ndarray) -> ThrusterFaults:
-    """Returns the fault state of a body whose `usable` thrusters, (n,) bool, may be used."""
+def steered_rank(matrix: np.ndarray, passive: Sequence[int]) -> int:
+    """Returns the rank of a (6, n) thruster matrix without its passive axes."""
+    return rank_of(np.delete(matrix, passive, axis=0))
+
+
+def thruster_state(body: Body, usable: np.ndarray, rank_of_all: int) -> ThrusterFaults:
+    """Returns the fault state of a body whose `usable` thrusters, (n,) bool, may be used. rank_of_all: `steered_rank` of all thrusters."""
     alive, matrix, passive = usable.copy(), body.thrusters.matrix, list(body.passive)
     u, values, _ = np.linalg.svd(matrix * alive, full_matrices=alive.size < 6)  # u is (6, 6) even with fewer thrusters
     rank = rank_by(values)
     dead = tuple(int(i) for i in np.flatnonzero(~alive))
     keep = _keep(u[:, :rank], u[:, rank:])
     keep[:, passive] = 0.0
-    with_all, left = (rank_of(np.delete(columns, passive, axis=0)) for columns in (matrix, matrix * alive))
-    return ThrusterFaults(alive, dead, with_all - left, keep, deceleration_of(body.thrusters, body.mass, passive, alive))
+    lost_axes = rank_of_all - steered_rank(matrix * alive, passive)
+    return ThrusterFaults(alive, dead, lost_axes, keep, deceleration_of(body.thrusters, body.mass, passive, alive))
 
 
 def _keep(made: np.ndarray, lost: np.ndarray) -> np.ndarray:

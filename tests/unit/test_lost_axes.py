@@ -10,7 +10,7 @@ from firmware_py.core.body import Body
 from firmware_py.core.faults import FaultDetector
 from firmware_py.core.pipeline import BodyPipeline
 from firmware_py.core.rotations import from_euler
-from firmware_py.core.thruster_state import thruster_state
+from firmware_py.core.thruster_state import steered_rank, thruster_state
 from firmware_py.core.types import EscFeedback, Estimate, Measured, ModuleInputs
 from firmware_py.description.failsafe_parameters import Faults
 from firmware_py.description.parameters import Parameters
@@ -107,7 +107,8 @@ def test_passive_axis_is_not_lost_with_a_thruster(passive: tuple[str, ...], lost
     """A diagonal horizontal pair of a BlueROV2 Heavy: what is left pushes surge and sway together, so one of them is lost."""
     usable = np.ones(8, dtype=bool)
     usable[[0, 3]] = False
-    assert thruster_state(leaving("bluerov2_heavy", *passive), usable).lost_axes == lost
+    body = leaving("bluerov2_heavy", *passive)
+    assert thruster_state(body, usable, steered_rank(body.thrusters.matrix, body.passive)).lost_axes == lost
 
 
 def test_mission_is_planned_without_moment_about_a_passive_axis() -> None:

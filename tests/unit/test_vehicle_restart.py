@@ -112,6 +112,7 @@ def test_modules_that_were_undocked_in_flight_are_named_and_not_armed_as_one(
     said = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet, hold=hold)
     both = "1 (number 1 on {bus}), 2 (number 2 on {bus})".format(bus=bus_of(tmp_path))
     assert said[0].startswith(f"warning: modules {both} were told to let go of joints that the fleet file has: ")
+    assert sum(line.startswith(f"texts and commands count modules in the order of the fleet file: {both}") for line in said) == 1
     assert to_arm == [set()]
     assert HOLDS not in said
     again = fly(tmp_path, tmp_path / "log", parameters=REARM, fleet=fleet, hold=hold)
