@@ -17,6 +17,10 @@ FAST_SHARE = 2.0
 """A propeller does not obey if it turns faster than this multiple of its believed speed plus `FAST_MARGIN`."""
 FAST_MARGIN = 0.25
 """Margin for a speed that is too high or of the wrong sign, as a share of full speed: deadband and lag explain smaller deviations."""
+EXCESS = 2.5
+"""A propeller whose force follows from its speed does not obey either if that force is this multiple of the believed one, both now and
+in the running mean, to which deadband and lag count for little. On the bench a healthy one's mean is at most 1.1 in any mode, at any rate
+and with frames 40 ms late; 1.3 with 60 % of them lost."""
 CLEAR = 4.0
 """A repeated standstill counts twice where the believed force is at least this many times the least judged force: the propeller is not
 just about to start."""
@@ -38,7 +42,7 @@ def count_feedback(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_
     Args:
         feedback: (k, 3, 2) per frame the indices (-1: none), speeds 1/min and EscStatus of its two thrusters.
         force_n, alive, full_n, rpm_at_full: per thruster believed force, whether usable, full forces (n, 2), full speed.
-        least_n: (n,) smallest believed force at which a standstill is judged, N; dead_share: the parameter.
+        least_n: (n,) smallest believed force at which a standstill or an excess is judged, N; dead_share: the parameter.
         needed: (3,) feedbacks in a row that suffice for ESC_FAILED, STALLED, WRONG_SPEED.
         counts: (n, 3) feedbacks in a row that showed ESC_FAILED, STALLED, WRONG_SPEED; a clear STALLED after another one counts twice.
         means: (n, 2) running means of reported times believed force, and of believed force squared, any unit.
@@ -60,11 +64,13 @@ def count_feedback(feedback, force_n, alive, full_n, rpm_at_full, least_n, dead_
             stands = abs(rpm) < dead_share * abs(believed) and not failed
             wrong_way = rpm * believed < 0.0 and not stands and abs(rpm - believed) > margin
             too_fast = abs(rpm) > FAST_SHARE * abs(believed) + margin
+            is_judged = abs(force_n[i]) >= least_n[i]
+            exceeds = is_judged and given * asked > EXCESS * asked * asked and means[i, 0] > EXCESS * means[i, 1]
             count[ESC_FAILED] = count[ESC_FAILED] + 1 if failed else 0
-            if abs(force_n[i]) >= least_n[i]:
+            if is_judged:
                 step = 2 if count[STALLED] > 0 and abs(force_n[i]) >= CLEAR * least_n[i] else 1
                 count[STALLED] = count[STALLED] + step if stands else 0
-            count[WRONG_SPEED] = count[WRONG_SPEED] + 1 if (wrong_way or too_fast) and not failed else 0
+            count[WRONG_SPEED] = count[WRONG_SPEED] + 1 if (wrong_way or too_fast or exceeds) and not failed else 0
             for kind in range(len(WHY)):
                 found = found or count[kind] >= needed[kind]
     return found

@@ -103,6 +103,14 @@ def test_two_feedbacks_of_a_disobedient_thruster_are_enough_and_one_is_not(water
     assert [words for _, words in water.run(0.2, 2.0 * PUSH)] == ["thruster 4 of module 1 does not obey: left out"]
 
 
+def test_thruster_stuck_at_more_than_it_is_asked_for_is_found_within_half_a_second(water: Water) -> None:
+    """Its speed is below twice the believed one plus a quarter of full speed: the running mean shows it."""
+    water.fly(1.0)
+    water.speed_factor[3] = 2.0
+    found = water.run(1.0)
+    assert [words for _, words in found] == ["thruster 4 of module 1 does not obey: left out"] and found[0][0] <= 0.5
+
+
 def test_two_feedbacks_of_a_clear_standstill_are_enough_and_one_is_not(water: Water) -> None:
     water.run(1.0, 2.0 * PUSH)
     busy = int(np.argmax(np.abs(water.believed.force_n)))
