@@ -1,18 +1,14 @@
 """Health: ages, means and worst cases of the readings of a body's modules."""
 
-import dataclasses
 import math
-from typing import Any
 
 import numpy as np
 import pytest
 
-from firmware_py.core.body import Body
-from firmware_py.core.failsafes import TABLE, Failsafes, Watch
+from firmware_py.core.failsafes import Failsafes
 from firmware_py.core.fence import outside
-from firmware_py.core.health import NEVER_S, Health
+from firmware_py.core.health import NEVER_S
 from firmware_py.core.health_monitor import HealthMonitor
-from firmware_py.core.module_reports import ModuleReports
 from firmware_py.core.names import Place
 from firmware_py.core.paper_estimator import TagOnlyEstimator
 from firmware_py.core.rotations import exp
@@ -24,7 +20,6 @@ from firmware_py.core.types import (
     Action,
     BodyPose,
     EscFeedback,
-    Estimate,
     Inputs,
     Measured,
     Mode,
@@ -37,52 +32,7 @@ from firmware_py.description.failsafe_parameters import Fence
 from firmware_py.description.parameters import Parameters
 from firmware_py.description.vehicle_file import load_vehicle
 from firmware_py.prepare.assembly import assemble
-
-TICK_NS = 10_000_000
-START_NS = 3600 * 10**9
-MODCUBE = load_vehicle("modcube")
-SIX = dataclasses.replace(MODCUBE, thruster=MODCUBE.thruster[:6])
-BODY = assemble([(0, 0, 0), (1, 0, 0)], [0, 0], [MODCUBE] * 2, [1, 3])
-EVERY = tuple(Place(module, channel) for module in (1, 3) for channel in range(8))
-SINGLE = assemble([(0, 0, 0)], [0], [MODCUBE], [1])
-ZERO = np.zeros(3)
-ESTIMATE = Estimate(
-    np.array([1.0, -2.0, 3.0]), np.array([1.0, 0, 0, 0]), np.zeros(6), ZERO, ZERO, np.array([0.01, 0.03, 0.02]),
-    np.full(3, 0.002), 30_000_000, 6.0, 6, 0, True,
-)  # fmt: skip
-
-
-class MonitorBench:
-    """A health monitor with a clock, for modules 1 and 3 of a fleet of four."""
-
-    def __init__(self, body: Body = BODY) -> None:
-        self.monitor = HealthMonitor(body, Parameters(), TICK_NS)
-        self.count = body.thrusters.f_max.size
-        self.tick = 0
-        self.time_ns = START_NS
-        self.dropped = 0
-        self.busy_s = 0.0
-        self.foreign: dict[str, bool] = {}
-
-    def step(self, one: ModuleInputs | None = None, three: ModuleInputs | None = None, *requests: Request, **more: Any) -> Health:
-        self.tick += 1
-        self.time_ns += TICK_NS
-        other = more.get("others", ModuleInputs())
-        modules = [other, one or ModuleInputs(), other, three or ModuleInputs()]
-        estimate = ESTIMATE._replace(**{k: v for k, v in more.items() if k in Estimate._fields})  # type: ignore[arg-type]
-        self.monitor.believed = modules
-        inputs = Inputs(self.tick, self.time_ns, modules, list(requests), dropped_frames=self.dropped, busy_s=self.busy_s, **self.foreign)
-        faults = ThrusterFaults(np.ones(self.count, dtype=bool), (), 0, np.eye(6), np.ones(2))
-        return self.monitor.step(inputs, estimate, list(requests), faults)
-
-    def wait(self, seconds: float, **more: object) -> Health:
-        for _ in range(round(seconds / 0.01)):
-            health = self.step(**more)  # type: ignore[arg-type]
-        return health
-
-
-def here(**said: object) -> ModuleInputs:
-    return ModuleInputs(heard=True, answered=True, **said)  # type: ignore[arg-type]
+from tests.unit.monitor_bench import BODY, ESTIMATE, EVERY, MODCUBE, SINGLE, SIX, START_NS, TICK_NS, ZERO, MonitorBench, here
 
 
 def test_module_whose_answers_come_for_other_ticks_is_silent_and_late() -> None:
@@ -552,164 +502,3 @@ def test_joined_body_remembers_a_frame_of_somebody_else_that_one_of_its_parts_he
         bench.step()
     both.monitor.take_over([one.monitor, other.monitor])
     assert getattr(both.step(), foreign)
-
-
-def test_push_is_told_as_the_current_that_would_push_so_sideways_on_the_mean_of_a_second() -> None:
-    """A vertical push comes from a payload, and its effect shows in the depth."""
-    bench, current_m_s = MonitorBench(), 0.7
-    push_n = BODY.drag.mean * current_m_s**2
-    force = push_n * np.array([0.6, -0.8, 0.0]) + np.array([0.0, 0.0, 50.0])
-    bench.step()
-    assert bench.step(force_w=force).push_m_s == pytest.approx(current_m_s * math.sqrt(1.0 - math.exp(-0.01)))
-    assert bench.wait(0.99, force_w=force).push_m_s == pytest.approx(current_m_s * math.sqrt(1.0 - math.exp(-1.0)))
-    assert bench.wait(9.0, force_w=force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
-    assert bench.step(force_w=-force).push_m_s == pytest.approx(current_m_s, rel=1e-3)
-
-
-@pytest.mark.parametrize("speed_m_s", [0.0, 0.3, -0.3])
-def test_push_upon_a_body_whose_drag_is_linear_too_is_no_more_current_than_there_is(speed_m_s: float) -> None:
-    body, current_m_s = assemble([(0, 0, 0)], [0], [load_vehicle("bluerov2")], [1]), 0.4
-
-    def drag_n(v_m_s: float) -> float:
-        return body.drag.mean * v_m_s * abs(v_m_s) + float(body.drag.linear[:3].mean()) * v_m_s
-
-    bench, push_n = MonitorBench(body), drag_n(speed_m_s) - drag_n(speed_m_s - current_m_s)
-    bench.step()
-    moves = np.array([speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0])
-    assert bench.wait(9.0, force_w=np.array([push_n, 0.0, 0.0]), nu=moves).push_m_s == pytest.approx(current_m_s, rel=1e-3)
-
-
-@pytest.mark.parametrize("speed_m_s", [-0.2, 0.3, 0.9])
-def test_push_upon_a_body_under_way_is_no_more_current_than_there_is(speed_m_s: float) -> None:
-    """Against 0.4 m/s, a body that moves at 0.2 m/s feels twice the push of one at rest."""
-    bench, current_m_s = MonitorBench(), 0.4
-    through_m_s = speed_m_s - current_m_s
-    push_n = BODY.drag.mean * (speed_m_s * abs(speed_m_s) - through_m_s * abs(through_m_s))
-    bench.step()
-    heard = bench.wait(9.0, force_w=np.array([0.0, -push_n, 0.0]), nu=np.array([0.1, -speed_m_s, 0.0, 0.0, 0.0, 0.0]))
-    assert heard.push_m_s == pytest.approx(current_m_s, rel=1e-3)
-
-
-@pytest.mark.parametrize("force_n", [math.nan, math.inf, 1e160, 1e6])
-@pytest.mark.parametrize("speed_m_s", [1e160, math.nan, 0.0])
-def test_push_that_nobody_could_believe_leaves_no_trace_in_the_mean(force_n: float, speed_m_s: float) -> None:
-    """One NaN stayed in the mean for the rest of the flight, and `pushed` acted never again."""
-    bench, current_m_s = MonitorBench(), 0.7
-    push_n = BODY.drag.mean * current_m_s**2
-    bench.step()
-    bench.step(force_w=np.array([force_n, 0.0, 0.0]), nu=np.array([speed_m_s, 0.0, 0.0, 0.0, 0.0, 0.0]))
-    assert bench.wait(9.0, force_w=np.array([push_n, 0.0, 0.0])).push_m_s == pytest.approx(current_m_s, rel=1e-3)
-
-
-def test_push_upon_a_body_without_drag_is_no_current() -> None:
-    bench = MonitorBench(dataclasses.replace(BODY, drag=dataclasses.replace(BODY.drag, nodes=0.0 * BODY.drag.nodes)))
-    assert bench.wait(9.0, force_w=np.array([5.0, 0.0, 0.0])).push_m_s == 0.0
-
-
-def test_module_that_leaves_a_large_body_feels_the_current_that_this_one_felt() -> None:
-    """Regression: the module took over the force on the whole body; one that parted without tags in 0.4 m/s gave up its place."""
-    row = assemble([(0, k, 0) for k in range(4)], [0] * 4, [load_vehicle("modcube")] * 4, [1, 3, 0, 2])
-    whole, part, current_m_s = MonitorBench(row), MonitorBench(SINGLE), 0.4
-    whole.step()
-    whole.wait(9.0, force_w=np.array([row.drag.mean * current_m_s**2, 0.0, 0.0]))
-    part.monitor.take_over([whole.monitor])
-    part.time_ns = whole.time_ns
-    assert part.step(force_w=np.array([SINGLE.drag.mean * current_m_s**2, 0.0, 0.0])).push_m_s == pytest.approx(current_m_s, rel=1e-3)
-
-
-def test_push_is_known_to_a_body_that_two_have_become() -> None:
-    bench, other = MonitorBench(), MonitorBench()
-    for each, push_n in ((bench, 3.0), (other, 8.0)):
-        each.step()
-        each.wait(9.0, force_w=np.array([push_n, 0.0, 0.0]))
-    joined = MonitorBench()
-    joined.time_ns = bench.time_ns
-    joined.monitor.take_over([bench.monitor, other.monitor])
-    assert joined.step(force_w=np.array([8.0, 0.0, 0.0])).push_m_s == pytest.approx(math.sqrt(8.0 / BODY.drag.mean), rel=1e-3)
-
-
-WELL = here(
-    gyro=ZERO, accel=ZERO, pressure_pa=1e5, voltage_v=12.0, leak=False, cabin_temperature_c=30.0, cabin_pressure_pa=1e5, mcu_state=2
-)  # fmt: skip
-UNWELL: dict[str, dict[str, Any]] = {
-    "leak": {"leak": True},
-    "battery_critical": {"voltage_v": 8.0},
-    "cabin_hot": {"cabin_temperature_c": 90.0},
-    "cabin_pressure": {"cabin_pressure_pa": 5e4},
-    "sensor_lost": {"pressure_pa": None},
-    "module_silent": {"heard": False, "answered": False, "mcu_state": None},
-    "module_late": {"answered": False},
-    "cabin_unknown": {"leak": None, "cabin_temperature_c": None, "cabin_pressure_pa": None},
-    "battery_unknown": {"voltage_v": None},
-    "battery_low": {"voltage_v": 10.0},
-}
-"""By fail-safe: what a module says that causes it."""
-
-
-@pytest.mark.parametrize("name", UNWELL)
-def test_fail_safe_names_the_modules_behind_it_in_a_body_of_several(name: str) -> None:
-    watch = Watch(next(row for row in TABLE if row.name == name), Parameters().failsafes)
-    unwell, words = dataclasses.replace(WELL, **UNWELL[name]), []
-    for one, three in ((WELL, unwell), (unwell, WELL), (unwell, unwell)):
-        pair, alone = MonitorBench(), MonitorBench(SINGLE)
-        for bench in (pair, alone):
-            bench.step(WELL, WELL)
-            for _ in range(300):
-                health = bench.step(one, three)
-            words.append(watch.words(health))
-            assert watch.beyond(health) or bench is alone
-    assert [text.partition(" (")[2] for text in words] == ["module 4)", "", "module 2)", "", "module 2, 4)", ""]
-
-
-@pytest.mark.parametrize("name", UNWELL)
-def test_fail_safe_that_spreads_to_another_module_is_told_again_once_and_only_after_its_delay(name: str) -> None:
-    """Regression: water in a second cabin was told of nowhere, nor was the second battery, sensor or silent module."""
-    bench, failsafes, unwell = MonitorBench(), Failsafes(Parameters().failsafes), dataclasses.replace(WELL, **UNWELL[name])
-    told: list[tuple[str, bool]] = []
-
-    def run(one: ModuleInputs, three: ModuleInputs, ticks: int) -> None:
-        for _ in range(ticks):
-            alarms = failsafes.step(bench.step(one, three), Mode.POSHOLD, False, True)
-            told.extend((alarm.words.partition(" (")[2], alarm.again) for alarm in alarms if alarm.begins and alarm.name == name)
-
-    run(WELL, WELL, 10)
-    run(unwell, WELL, 1000)
-    run(unwell, unwell, 1)
-    assert told == [("module 2)", False)], "one bad reading of another module does not count"
-    run(unwell, unwell, 1000)
-    assert told[1:] == [("module 2, 4)", False)]
-    run(unwell, WELL, 1000)
-    run(unwell, unwell, 1000)
-    assert len(told) == 2, "a module that the texts have named is not told of again"
-
-
-def test_body_that_is_made_of_another_does_not_tell_again_of_the_modules_that_were_named() -> None:
-    bench, failsafes, whole = MonitorBench(), Failsafes(Parameters().failsafes), Failsafes(Parameters().failsafes)
-    dry, wet = here(leak=False), here(leak=True)
-    for one, three in ((dry, dry), *[(wet, dry)] * 100):
-        failsafes.step(bench.step(one, three), Mode.POSHOLD, False, True)
-    whole.take_over([failsafes])
-    alarms = [alarm for _ in range(100) for alarm in whole.step(bench.step(wet, dry), Mode.POSHOLD, False, True) if alarm.name == "leak"]
-    assert alarms == []
-    alarms = [alarm for _ in range(100) for alarm in whole.step(bench.step(wet, wet), Mode.POSHOLD, False, True) if alarm.name == "leak"]
-    assert [alarm.words for alarm in alarms] == ["water in a cabin (module 2, 4)"]
-
-
-def test_modules_that_lost_different_sensors_at_different_times_are_all_named() -> None:
-    bench, watch = MonitorBench(), Watch(next(row for row in TABLE if row.name == "sensor_lost"), Parameters().failsafes)
-    bench.step(WELL, WELL)
-    without_imu, without_pressure = dataclasses.replace(WELL, gyro=None), dataclasses.replace(WELL, pressure_pa=None)
-    for _ in range(200):
-        bench.step(without_imu, WELL)
-    for _ in range(200):
-        health = bench.step(without_imu, without_pressure)
-    assert watch.words(health).endswith(" for 4.0 s (module 2, 4)")
-
-
-def test_body_inherits_every_report_of_its_modules_and_of_no_other() -> None:
-    """A figure of a module that is added to ModuleReports needs no second place: forgotten there, it began anew at every dock."""
-    pair, one = ModuleReports([1, 3]), ModuleReports([3])
-    for tables in vars(pair).values():
-        tables.update({1: "told by 1", 3: "told by 3"})
-    one.take_over(pair)
-    assert vars(one) == {name: {3: "told by 3"} for name in vars(pair)}
