@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -17,7 +18,8 @@ from firmware_py.description.schema import (
     is_file_name,
     is_there,
     limits_of,
-    read_toml,
+    parse_toml,
+    read_text,
     repeated,
     unknown_name,
 )
@@ -52,16 +54,23 @@ def load_vehicle(name: str, folder: Path | None = None) -> Vehicle:
         path = Path(str(resources.files("firmware_py") / "vehicles" / f"{name}.toml"))
     else:
         raise unknown_name("vehicle", name, vehicle_names())
-    table, source = read_toml(path)
-    vehicle: Vehicle = build(Vehicle, table, source)
-    _check_body(vehicle, source)
-    _check_drag(vehicle.drag, source)
-    _check_damping(vehicle, source)
+    source = Source(str(path), read_text(path))
+    vehicle = _vehicle_of(source)
     if vehicle.hull.mesh:
         mesh = (path.parent / vehicle.hull.mesh).absolute()  # for logs, and for printing the vehicle as a file elsewhere
         if not is_there(mesh, Path.is_file):
             raise source.error(("hull", "mesh"), f"{mesh}: there is no such mesh")
         vehicle = dataclasses.replace(vehicle, hull=dataclasses.replace(vehicle.hull, mesh=str(mesh)))
+    return vehicle
+
+
+@functools.lru_cache(maxsize=64)
+def _vehicle_of(source: Source) -> Vehicle:
+    """The vehicle in the text of `source`, checked; remembered, because a scenario asks for each of its vehicles a dozen times."""
+    vehicle: Vehicle = build(Vehicle, parse_toml(source.text, source.path), source)
+    _check_body(vehicle, source)
+    _check_drag(vehicle.drag, source)
+    _check_damping(vehicle, source)
     return vehicle
 
 

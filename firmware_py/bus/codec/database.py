@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from importlib import resources
 from typing import Any
 
@@ -16,6 +17,10 @@ def load_database() -> Any:
     return cantools.database.load_string(text, "dbc", frame_id_mask=0x7E0)
 
 
+_shipped = functools.cache(load_database)
+"""That database, parsed once, for codecs, which only read it."""
+
+
 class Codec:
     """All messages of the DBC."""
 
@@ -28,8 +33,8 @@ class Codec:
 
     @classmethod
     def load(cls) -> Codec:
-        """Loads the DBC shipped with the package (20 ms; load it once and pass it on)."""
-        return cls(load_database())
+        """Loads the DBC shipped with the package (20 ms the first time; load it once and pass it on)."""
+        return cls(_shipped())
 
     def message(self, name: str) -> MessageCodec:
         """Returns the message called `name`. Raises KeyError, which lists the known names."""
