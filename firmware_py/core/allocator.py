@@ -31,7 +31,7 @@ SHARE_WEIGHT = 1e3
 BEYOND = 2.0
 """A wrench above this many times what all thrusters together could give is scaled down first, so that the problem stays well scaled."""
 HALVINGS = 8
-"""Bisection steps for the share that the supplies can feed; they find it to 0.4 %."""
+"""Bisection steps for the share that the supplies can feed; they find it to 0.4 % of the wrench, or of BEYOND where that is less."""
 TINY = 1e-9
 """Force or moment, N and N m, below which it counts as zero."""
 MAX_RESIDUAL = 1e-3
@@ -148,11 +148,12 @@ class Allocator:
         return bool(are_fed(thrust.force_n, t.power_forward, t.power_reverse, t.module, self._limits.supply_w))
 
     def _largest_share(self, wrench: np.ndarray, beside: np.ndarray) -> tuple[np.ndarray, Thrust]:
-        """Finds the largest share of `wrench` that the supplies can feed together with all of `beside`.
+        """Finds the largest share of `wrench` that the supplies can feed together with all of `beside`. The search begins at one that is
+        not far too large: of the 4000 N that a body wants far off its place, even the smallest step would be more than they can feed.
 
         Returns that sum of the two and its forces; `beside` alone where no share can be fed.
         """
-        share, step, found = 0.0, 1.0, self._within(beside)
+        share, step, found = 0.0, self._prescale(wrench), self._within(beside)
         for _ in range(HALVINGS):
             step *= 0.5
             thrust = self._within(beside + (share + step) * wrench)

@@ -410,6 +410,19 @@ def test_body_that_cannot_be_fed_gives_way_in_the_force_that_does_not_hold_first
     assert fed_less > 5
 
 
+@pytest.mark.parametrize("force", [300.0, 3000.0, 30000.0])
+def test_body_that_wants_far_more_than_can_be_fed_pushes_no_less_for_it(body: Body, force: float) -> None:
+    """As one does that was carried metres off its place. Of more than 4 kN a module used to be given its holding force alone."""
+    allocator = Allocator(body, Allocation())
+    limits = ThrustLimits(body.thrusters.f_min, body.thrusters.f_max, np.full(len(body.modules), 106.0))
+    allocator.confine(limits)
+    for direction in np.eye(3):
+        little, much = (allocator.step(np.r_[size * len(body.modules) * direction, 0.1, -0.2, 0.1]) for size in (30.0, force))
+        made = [float(direction @ thrust.achieved[:3]) for thrust in (little, much)]
+        assert little.scale[0] < 1.0 and made[1] > 0.95 * made[0]
+        assert np.all(power_w(body, much) <= limits.supply_w)
+
+
 def test_paper_s_allocation_leaves_the_supply_to_the_limiter(single: Body) -> None:
     allocator = Allocator(single, replace(PLAIN, mode="pseudo_inverse"))
     wrench = np.array([15.0, 0.0, 0.0, 0.0, 0.4, 0.0])
