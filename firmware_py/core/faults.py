@@ -32,7 +32,7 @@ on the bench from 0.10 to 0.25 N where the file says 0.17."""
 SILENT_NS = 500_000_000
 """Silence, or deafness, after which a module's thrusters are excluded, if the others can make every wrench without them; the fail-safe
 `module_silent` acts then too. A silent module that hears nothing either has stopped its thrusters after 100 ms (can_dbc/README.md); one
-that still hears stops them because of the exclusion."""
+that still hears stops them because of the exclusion. Those of a deaf module are excluded even if the others cannot."""
 WELL_AGAIN = 10
 """Feedbacks in a row without a fault, one second's, after which a thruster whose ESC had failed is used again."""
 REPORT_NS = 75_000_000
@@ -214,12 +214,17 @@ class FaultDetector:
         return thruster_state(self._body, usable, self._rank)
 
     def _usable_state(self) -> ThrusterFaults:
-        """Returns the fault state: all thrusters that obey, without those of silent modules where the others have the same rank."""
+        """Returns the fault state: all thrusters that obey, without those of silent modules where the others have the same rank. Those of
+        modules that hear no commands stand still for certain: they are used only where no others are left.
+        """
         obeying = self._state_of(self._obeys)
         if not self._silent:
             return obeying
         without = self._state_of(self._obeys & ~np.isin(self._t.module, self._silent))
-        return without._replace(dead=obeying.dead) if without.lost_axes == obeying.lost_axes else obeying
+        if without.lost_axes != obeying.lost_axes:
+            turning = self._obeys & ~np.isin(self._t.module, [i for i in self._silent if self._watches[i].deaf])
+            without = self._state_of(turning if turning.any() else self._obeys)
+        return without._replace(dead=obeying.dead)
 
     def _judge_feedback(self, feedbacks: list[list[EscFeedback]], force_n: np.ndarray) -> None:
         """Compares every ESC's feedback with the believed force of its thruster."""

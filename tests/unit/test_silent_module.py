@@ -120,6 +120,24 @@ def test_thrusters_of_a_module_that_hears_no_commands_are_left_out_until_it_does
     assert rig.run(1.0, 0, 1) == ["thrusters of every module are used again"] and rig.used == {0, 1}
 
 
+@pytest.mark.parametrize("is_deaf_first", [True, False])
+def test_thrusters_of_a_module_that_hears_no_commands_are_not_counted_on_though_the_others_cannot_make_every_wrench(
+    is_deaf_first: bool,
+) -> None:
+    """They stand still: what they were asked for in vain used to be taken for a push, against which they were asked for ever more."""
+    rig = DetectorRig()
+    for is_deaf in (is_deaf_first, not is_deaf_first):
+        if is_deaf:
+            assert rig.run(1.0, 0, 1, deaf=1)[-1] == "thrusters of silent module 2 are left out"
+        else:
+            rig.detector._lose(2, "stands still")
+            rig.detector._lose(3, "stands still")
+    now, module = rig.detector.now, rig.body.thrusters.module
+    assert not now.alive[module == 1].any() and now.alive[module == 0].sum() == 6
+    assert (now.dead, now.lost_axes) == ((2, 3), 1)
+    assert rig.run(1.0, 0, 1) == ["thrusters of every module are used again"] and rig.detector.now.lost_axes == 0
+
+
 def test_liar_in_another_module_is_found_while_a_module_that_hears_no_commands_is_left_out() -> None:
     body = DetectorRig().body
     water = Water(body=body)
