@@ -202,12 +202,13 @@ class FaultDetector:
         if not np.array_equal(alive, self.now.alive):
             self.changed = True
             self._motion.forget()
-            silent = name_modules(self._modules[i] for i in self._silent)
-            if (self.now.alive < self._obeys).any():
-                self.words.append(f"thrusters of silent {silent} are left out")
-            elif self._silent:
-                self.words.append(f"thrusters of silent {silent} are used blindly: the others cannot make every wrench")
-            else:
+            used = [self._modules[i] for i in self._silent if self.now.alive[self._t.module == i].any()]
+            left_out = [self._modules[i] for i in self._silent if self._modules[i] not in used]
+            if left_out:
+                self.words.append(f"thrusters of silent {name_modules(left_out)} are left out")
+            if used:
+                self.words.append(f"thrusters of silent {name_modules(used)} are used blindly: the others cannot make every wrench")
+            if not self._silent:
                 self.words.append("thrusters of every module are used again")
 
     def _state_of(self, usable: np.ndarray) -> ThrusterFaults:

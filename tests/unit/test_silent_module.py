@@ -138,6 +138,16 @@ def test_thrusters_of_a_module_that_hears_no_commands_are_not_counted_on_though_
     assert rig.run(1.0, 0, 1) == ["thrusters of every module are used again"] and rig.detector.now.lost_axes == 0
 
 
+def test_module_whose_thrusters_are_left_out_is_named_apart_from_one_whose_are_used_blindly() -> None:
+    """Of two that are both to be left out, what the deaf one is asked for is lost for certain, and the silent one may still hear."""
+    rig = DetectorRig()
+    assert rig.run(1.0, 1, deaf=1)[-2:] == [
+        "thrusters of silent module 2 are left out",
+        "thrusters of silent module 1 are used blindly: the others cannot make every wrench",
+    ]
+    assert rig.used == {0}
+
+
 def test_liar_in_another_module_is_found_while_a_module_that_hears_no_commands_is_left_out() -> None:
     body = DetectorRig().body
     water = Water(body=body)
