@@ -31,7 +31,8 @@ SHARE_WEIGHT = 1e3
 BEYOND = 2.0
 """A wrench above this many times what all thrusters together could give is scaled down first, so that the problem stays well scaled."""
 HALVINGS = 8
-"""Bisection steps for the share that the supplies can feed; they find it to 0.4 % of the wrench, or of BEYOND where that is less."""
+"""Bisection steps for the share that the supplies can feed; they find it to 0.4 % of the wrench, or of BEYOND times what all
+thrusters together could give where that is less."""
 TINY = 1e-9
 """Force or moment, N and N m, below which it counts as zero."""
 MAX_RESIDUAL = 1e-3

@@ -76,6 +76,8 @@ class FaultDetector:
         """Ticks that each module has been silent or deaf; counts down again while an excluded module is heard."""
         self._silent: list[int] = []
         """Modules, by place in the body, whose thrusters are left out because they are silent or hear no commands."""
+        self._deaf: list[int] = []
+        """Those of them that have said since that they hear no commands: their thrusters stand still."""
         self._watches = [CommandWatch(period_ns) for _ in body.modules]
         self._stopped: list[int] = []
         """Thrusters that may stand still because their module obeys no commands, or did not until just now."""
@@ -111,6 +113,7 @@ class FaultDetector:
                 self._silence[i] = other._silence[j]
                 self._watches[i] = other._watches[j]
                 self._silent += [i] if j in other._silent else []
+                self._deaf += [i] if j in other._deaf else []
                 for channel, thruster in self._thruster_at[i].items():
                     number = other._thruster_at[j][channel]
                     self._obeys[thruster] = other._obeys[number]
@@ -124,7 +127,7 @@ class FaultDetector:
         self._counts[:] = 0
         self._motion.reset()
         self.changed = not self.now.alive.all()
-        self._obeys[:], self._silent, self._well = True, [], {}
+        self._obeys[:], self._silent, self._deaf, self._well = True, [], [], {}
         self.now = self._state_of(self._obeys)
 
     def step(
@@ -186,7 +189,7 @@ class FaultDetector:
 
     def _judge_silence(self, modules: list[ModuleInputs], armed: bool) -> None:
         """Excludes the thrusters of modules that have fallen silent or deaf; re-admits them once a module has been well for as long."""
-        before = self._silent
+        before, deaf_before = self._silent, self._deaf
         for i, module in enumerate(modules):
             if not module.heard or self._watches[i].deaf:
                 self._silence[i] = min(self._silence[i] + 1, self._silent_after)
@@ -194,9 +197,10 @@ class FaultDetector:
                 self._silence[i] = self._silence[i] - 1 if i in before else 0
         quiet = [i for i, ticks in enumerate(self._silence) if ticks == self._silent_after or (ticks and i in before)]
         self._silent = quiet if armed else []
-        if self._silent == before:
+        self._deaf = [i for i in self._silent if self._watches[i].deaf or i in deaf_before]
+        if (self._silent, self._deaf) == (before, deaf_before):
             return
-        deaf = [self._modules[i] for i in self._silent if self._watches[i].deaf and i not in before]
+        deaf = [self._modules[i] for i in self._deaf if i not in deaf_before]
         self.words += [f"{name_modules(deaf)} obeys no commands: its thrusters stop"] if deaf else []
         alive, self.now = self.now.alive, self._usable_state()
         if not np.array_equal(alive, self.now.alive):
@@ -223,7 +227,7 @@ class FaultDetector:
             return obeying
         without = self._state_of(self._obeys & ~np.isin(self._t.module, self._silent))
         if without.lost_axes != obeying.lost_axes:
-            turning = self._obeys & ~np.isin(self._t.module, [i for i in self._silent if self._watches[i].deaf])
+            turning = self._obeys & ~np.isin(self._t.module, self._deaf)
             without = self._state_of(turning if turning.any() else self._obeys)
         return without._replace(dead=obeying.dead)
 

@@ -138,6 +138,17 @@ def test_thrusters_of_a_module_that_hears_no_commands_are_not_counted_on_though_
     assert rig.run(1.0, 0, 1) == ["thrusters of every module are used again"] and rig.detector.now.lost_axes == 0
 
 
+def test_silent_module_that_is_used_blindly_is_left_out_once_it_says_that_it_hears_no_commands() -> None:
+    """As one does whose MCU has restarted. It stays left out when it falls silent again: nothing tells that it hears."""
+    rig = DetectorRig()
+    rig.detector._lose(2, "stands still")
+    rig.detector._lose(3, "stands still")
+    assert rig.run(1.0, 0) == [] and rig.used == {1}
+    assert rig.run(0.1, 0, 1, deaf=1) == ["module 2 obeys no commands: its thrusters stop", "thrusters of silent module 2 are left out"]
+    assert rig.run(1.0, 0) == [] and rig.used == set()
+    assert rig.run(1.0, 0, 1) == ["thrusters of every module are used again"] and rig.used == {1}
+
+
 def test_module_whose_thrusters_are_left_out_is_named_apart_from_one_whose_are_used_blindly() -> None:
     """Of two that are both to be left out, what the deaf one is asked for is lost for certain, and the silent one may still hear."""
     rig = DetectorRig()
