@@ -140,12 +140,14 @@ def test_thrusters_of_a_module_that_hears_no_commands_are_not_counted_on_though_
 
 def test_silent_module_that_is_used_blindly_is_left_out_once_it_says_that_it_hears_no_commands() -> None:
     """As one does whose MCU has restarted. It stays left out when it falls silent again: nothing tells that it hears."""
-    rig = DetectorRig()
+    rig, other = DetectorRig(), DetectorRig()
     rig.detector._lose(2, "stands still")
     rig.detector._lose(3, "stands still")
     assert rig.run(1.0, 0) == [] and rig.used == {1}
     assert rig.run(0.1, 0, 1, deaf=1) == ["module 2 obeys no commands: its thrusters stop", "thrusters of silent module 2 are left out"]
     assert rig.run(1.0, 0) == [] and rig.used == set()
+    other.detector.take_over([rig.detector])
+    assert other.used == set(), "a body that is made of it knows as much"
     assert rig.run(1.0, 0, 1) == ["thrusters of every module are used again"] and rig.used == {1}
 
 
