@@ -33,6 +33,9 @@ that mode, and where it "only warns" its action does not apply. While a fail-saf
 WATCHED = """\
 - `attitude_lost`: the angle to the set-point, RMS over a second, about the axes that the thrusters left can turn. Something holds the body,
   its thrusters or gains do not fit it, or frames come so late that it swings.
+- `place_lost`: the distance to the set-point, RMS over a second, along all axes. Something pushes, holds or tows the body harder than its
+  thrusters can push, or the tags have jumped. It goes on swimming back by itself; with action 2 it lets go of the place and holds the one
+  where it is.
 - `module_silent`: no frame of a module comes, or it reports that it obeys no commands (BOOT, TIMEOUT or FAULT in MCU_STATUS).
   While every module of a body reports so, its path waits and its set-point rests where the body is: it does not swim back by itself
   afterwards.

@@ -100,6 +100,7 @@ TABLE = (
     Row("cabin_pressure", "cabin pressure off", "cabin_change_pa", " by {:.0f} Pa", of_modules=told("cabin_change_pa")),
     Row("axis_lost", "the thrusters left cannot make every wrench", "lost_axes"),
     Row("attitude_lost", "attitude not held", "attitude_off_deg", ": {:.0f} deg off", modes=UPRIGHT),
+    Row("place_lost", "place not held", "place_off_m", ": {:.1f} m off", modes=PLACED),
     Row("depth_unknown", "depth unknown", "depth_unknown_s", LASTS, modes=PLACED | {Mode.ALT_HOLD}),
     Row("tag_gone", "no tag", "tag_age_s", LASTS, modes=PLACED, forced_modes=frozenset({Mode.ALT_HOLD})),
     Row("partner_lost", "a docked partner is lost", "partner_lost", who=attrgetter("open_joint_words")),

@@ -110,6 +110,8 @@ class Health(NamedTuple):
     attitude_off_deg: float = 0.0
     """Angle between the body and its set-point, about axes that its thrusters can turn, deg; RMS over a second, because a body that swings
     passes its set-point again and again."""
+    place_off_m: float = 0.0
+    """Distance of the body from its set-point, m; RMS over a second."""
     reports: ModuleReports = ModuleReports([0])
     """Of every module, the last ones: they go on changing. They name the modules behind the figures above."""
 

@@ -71,6 +71,7 @@ class _Latest:
     missed_percent: float = 0.0
     push_m2_s2: float = 0.0
     off_rad2: float = 0.0
+    off_m2: float = 0.0
 
 
 class HealthMonitor:
@@ -200,14 +201,18 @@ class HealthMonitor:
             still_s=min(at - self._reports.hears_ns[m] for m, at in self._reports.heard_ns.items()) * 1e-9,
             estop_box_age_s=_age_s(latest.estop_box_ns, now),
             attitude_off_deg=math.degrees(math.sqrt(latest.off_rad2)),
+            place_off_m=math.sqrt(latest.off_m2),
             reports=self._reports,
         )
 
     def compare(self, setpoint: Setpoint, estimate: Estimate, keep: np.ndarray) -> None:
-        """Notes how far the body is turned from its set-point, while that is known. `keep`: (6, 6) ThrusterFaults.keep."""
-        if estimate.ready:
-            off_rad = keep[3:, 3:] @ difference(setpoint.q_wb, estimate.q_wb)
-            self._latest.off_rad2 += 1e-9 * self._period_ns / MEAN_S * (off_rad.dot(off_rad) - self._latest.off_rad2)
+        """Notes how far the body is from its set-point and turned from it, while that is known. `keep`: (6, 6) ThrusterFaults.keep."""
+        if not estimate.ready:
+            return
+        latest, share = self._latest, 1e-9 * self._period_ns / MEAN_S
+        off_m, off_rad = setpoint.p_wb - estimate.p_wb, keep[3:, 3:] @ difference(setpoint.q_wb, estimate.q_wb)
+        latest.off_m2 += share * (off_m.dot(off_m) - latest.off_m2)
+        latest.off_rad2 += share * (off_rad.dot(off_rad) - latest.off_rad2)
 
     def _listen(self, modules: Sequence[ModuleInputs], now: int) -> None:
         for index in self._reports.heard_ns:

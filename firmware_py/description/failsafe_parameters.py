@@ -88,6 +88,14 @@ class Failsafes:
     attitude_lost_delay_s: float = delay(2.0, "FS_ATT_S")
     attitude_lost_action: int = action(1, "FS_ATT_ACT")
     attitude_lost_latched: int = latched(0, "FS_ATT_LAT")
+    # the body is not where it is told to be: something pushes, holds or tows it harder than its thrusters can, or its tags have jumped
+    place_lost_limit: float = quantity(
+        0.5, unit="m", low=0.05, high=100, help="largest permitted distance between body and set-point, RMS over one second",
+        mavlink="FS_PLC_LIM",
+    )
+    place_lost_delay_s: float = delay(3.0, "FS_PLC_S")
+    place_lost_action: int = action(1, "FS_PLC_ACT")
+    place_lost_latched: int = latched(0, "FS_PLC_LAT")
     # depth unknown
     depth_unknown_limit: float = quantity(
         5.0, unit="s", low=0.1, high=600,

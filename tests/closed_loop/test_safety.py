@@ -175,6 +175,27 @@ def test_robot_that_swings_as_all_frames_are_late_is_told_of_or_disarmed(action:
     assert text.startswith("fail-safe on") and np.sqrt(np.mean(np.square(off_deg[at - 300 : at]))) > 25.0 and max(off_deg[300:500]) < 3.0
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("force_n", "is_told"), [(20.0, True), (6.0, False)])
+def test_robot_that_is_pushed_off_its_place_is_told_of_until_it_is_back(force_n: float, is_told: bool) -> None:
+    off_m: list[float] = []
+    told: list[tuple[int, str]] = []
+
+    def watch(bench: Bench, outputs: Outputs) -> None:
+        (record,) = outputs.records
+        off_m.append(float(np.linalg.norm(record.setpoint.p_wb - bench.nodes.world.body_truth(0).p_wb)))
+        told.extend((outputs.tick, event.text) for event in outputs.events if "fail-safe" in event.text)
+
+    fly("faults", 25.0, Fault(kind="push", value=force_n, at_s=5.0, until_s=11.0), lambda bench: None, watch)
+    if not is_told:
+        assert told == [] and 0.02 < max(off_m[300:]) < 0.3
+        return
+    (begins, text), (ends, last) = told
+    assert text.startswith("fail-safe on: place not held: ") and text.endswith(" m off") and last == "fail-safe over: place not held"
+    assert min(off_m[begins - 250 : begins]) > 0.5 and max(off_m[300:490]) < 0.02
+    assert max(off_m[ends - 150 :]) < 0.5 and off_m[-1] < 0.02
+
+
 def fly(
     scenario: str, seconds: float, fault: Fault, prepare: Callable[[Bench], None], watch: Callable[[Bench, Outputs], None],
     parameters: Parameters | None = None,

@@ -93,6 +93,7 @@ COUNTS = {
     "rejected": POSE_MODES | {Mode.ALT_HOLD, Mode.STABILIZE},
     "tag_lost": POSE_MODES,
     "attitude_lost": set(Mode) - {Mode.MANUAL, Mode.MOTOR_DETECT},
+    "place_lost": POSE_MODES,
     "pushed": POSE_MODES - {Mode.DOCK},
     "tag_late": POSE_MODES - {Mode.POSHOLD},
     "fence": POSE_MODES - {Mode.POSHOLD},

@@ -303,6 +303,19 @@ def test_body_that_swings_is_off_its_set_point_by_the_rms_about_axes_that_it_can
     assert bench.step().attitude_off_deg == off_deg[-1], "without an attitude nobody knows better"
 
 
+def test_body_that_swings_is_off_its_place_by_the_rms_along_all_axes_even_those_that_it_cannot_push() -> None:
+    bench, away_m = MonitorBench(), np.sqrt(2.0) * np.array([0.3, -0.4, 1.2])
+    off_m = []
+    for tick in range(1000):
+        p_wb = np.array([5.0, 6.0, 7.0]) + away_m * np.sin(2.0 * np.pi * tick / 50)
+        bench.monitor.compare(rest_at(np.array([5.0, 6.0, 7.0]), exp(ZERO)), ESTIMATE._replace(p_wb=p_wb), np.zeros((6, 6)))
+        off_m.append(bench.step().place_off_m)
+    assert off_m[99] == pytest.approx(1.3 * math.sqrt(1.0 - math.exp(-1.0)), rel=0.02)
+    assert off_m[-1] == pytest.approx(1.3, rel=0.1)
+    bench.monitor.compare(rest_at(ZERO, exp(ZERO)), ESTIMATE._replace(ready=False), np.eye(6))
+    assert bench.step().place_off_m == off_m[-1], "without an estimate nobody knows better"
+
+
 def test_e_stop_box_counts_once_it_was_heard_by_any_part_of_the_body() -> None:
     bench, later = MonitorBench(), MonitorBench()
     assert math.isnan(bench.wait(5.0).estop_box_age_s)
