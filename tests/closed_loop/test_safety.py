@@ -196,6 +196,26 @@ def test_robot_that_is_pushed_off_its_place_is_told_of_until_it_is_back(force_n:
     assert max(off_m[ends - 150 :]) < 0.5 and off_m[-1] < 0.02
 
 
+@pytest.mark.slow
+def test_robot_that_is_pushed_off_its_place_holds_where_it_is_if_told_to() -> None:
+    place: list[np.ndarray] = []
+    truth: list[np.ndarray] = []
+    told: list[int] = []
+
+    def watch(bench: Bench, outputs: Outputs) -> None:
+        place.append(outputs.records[0].setpoint.p_wb.copy())
+        truth.append(bench.nodes.world.body_truth(0).p_wb.copy())
+        told.extend(len(place) - 1 for event in outputs.events if event.text.startswith("fail-safe on: place not held"))
+
+    failsafes = dataclasses.replace(Parameters().failsafes, place_lost_action=int(Level.HOLD))
+    push = Fault(kind="push", value=20.0, at_s=5.0, until_s=11.0)
+    fly("faults", 25.0, push, lambda bench: None, watch, dataclasses.replace(Parameters(), failsafes=failsafes))
+    (at,) = told
+    assert 800 < at < 1100 and np.ptp(place[300:at], axis=0).max() < 0.01
+    assert np.linalg.norm(place[at] - place[at - 1]) > 1.0 and np.linalg.norm(place[at] - truth[at]) < 0.1
+    assert np.ptp(place[at + 200 :], axis=0).max() < 0.01 and np.linalg.norm(truth[-1] - place[-1]) < 0.02
+
+
 def fly(
     scenario: str, seconds: float, fault: Fault, prepare: Callable[[Bench], None], watch: Callable[[Bench, Outputs], None],
     parameters: Parameters | None = None,
