@@ -1,8 +1,8 @@
 """Run every test that this machine can run; name what was left out, and why, in the last lines.
 
-Arguments: the Debian packages that the tests marked `vcan` need. Those tests run in a virtual machine, in parallel with everything else,
-and compile for it first. Before all other tests, in parallel with the setup of the clients, `make lint` checks the code, and numba compiles
-what is not compiled yet, so that no two processes of pytest do. The exit status is the worst of pytest's two and lint's.
+Arguments: the Debian packages that the tests marked `vcan` need. Those tests run in a virtual machine, in parallel with all others. Before
+that, in parallel with the setup of the clients, `make lint` checks the code, and numba compiles what is not compiled yet, so that no two
+processes of pytest do. The exit status is the worst of pytest's two and lint's.
 """
 
 import os
@@ -52,9 +52,9 @@ def main() -> int:
         left_out["vcan"] = f"missing Debian packages: {' '.join(missing)} (make setup-system)"
     make = [os.environ.get("MAKE", "make"), "--no-print-directory"]
     with tempfile.TemporaryFile("w+") as report:
-        beside = None if missing else subprocess.Popen(VCAN, stdout=report, stderr=subprocess.STDOUT)
         with subprocess.Popen(COMPILE, stdout=subprocess.DEVNULL), subprocess.Popen([*make, "lint"]) as lint:
             subprocess.run([*make, "setup-clients"])
+        beside = None if missing else subprocess.Popen(VCAN, stdout=report, stderr=subprocess.STDOUT)
         if not CLIENTS.exists():
             left_out["clients"] = f"{CLIENTS.parent} is not complete (make setup-clients)"
         markers = " and ".join(f"not {marker}" for marker in sorted({"vcan", *left_out}))
