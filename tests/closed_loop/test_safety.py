@@ -159,7 +159,6 @@ def test_robot_without_tags_surfaces_though_it_believes_to_be_there_and_rests_th
 @pytest.mark.slow
 @pytest.mark.parametrize("action", [Level.WARN, Level.DISARM])
 def test_robot_that_swings_as_all_frames_are_late_is_told_of_or_disarmed(action: Level) -> None:
-    failsafes = dataclasses.replace(Parameters().failsafes, attitude_lost_action=int(action))
     off_deg: list[float] = []
     told: list[tuple[int, str]] = []
 
@@ -170,7 +169,7 @@ def test_robot_that_swings_as_all_frames_are_late_is_told_of_or_disarmed(action:
         assert record.state == (State.ARMED if outputs.tick >= 300 and (action == Level.WARN or not told) else State.DISARMED)
 
     late = Fault(kind="frame_delay", value=130.0, at_s=5.0)
-    fly("faults", 25.0, late, lambda bench: None, watch, dataclasses.replace(Parameters(), failsafes=failsafes))
+    fly("faults", 25.0, late, lambda bench: None, watch, Parameters().replace("failsafes.attitude_lost_action", int(action)))
     at, text = told[0]
     assert text.startswith("fail-safe on") and np.sqrt(np.mean(np.square(off_deg[at - 300 : at]))) > 25.0 and max(off_deg[300:500]) < 3.0
 
@@ -207,9 +206,8 @@ def test_robot_that_is_pushed_off_its_place_holds_where_it_is_if_told_to() -> No
         truth.append(bench.nodes.world.body_truth(0).p_wb.copy())
         told.extend(len(place) - 1 for event in outputs.events if event.text.startswith("fail-safe on: place not held"))
 
-    failsafes = dataclasses.replace(Parameters().failsafes, place_lost_action=int(Level.HOLD))
     push = Fault(kind="push", value=20.0, at_s=5.0, until_s=11.0)
-    fly("faults", 25.0, push, lambda bench: None, watch, dataclasses.replace(Parameters(), failsafes=failsafes))
+    fly("faults", 25.0, push, lambda bench: None, watch, Parameters().replace("failsafes.place_lost_action", int(Level.HOLD)))
     (at,) = told
     assert 800 < at < 1100 and np.ptp(place[300:at], axis=0).max() < 0.01
     assert np.linalg.norm(place[at] - place[at - 1]) > 1.0 and np.linalg.norm(place[at] - truth[at]) < 0.1
